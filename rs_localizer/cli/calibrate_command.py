@@ -186,7 +186,7 @@ def _calibrated(
             own_stamps=source.own_stamps, done=bar.update,
         )  # fmt: skip
     print("\n".join(verdict.table(found, args.rate)))
-    image_input.tell_telemetry(args, verdict.readout_time(found))
+    image_input.print_telemetry(args, verdict.readout_time(found))
     if intrinsics:
         print("\n".join(verdict.of_lens(found)))
     if source.imu is not None:
@@ -208,7 +208,7 @@ def _read(args: Options, config: NodeConfig) -> _Input:
                 return replace(_correspondences(args, bag, config), imu=imu)
     with image_input.opened(args, calibrated=False) as source:
         found = _detected(args, source.shots)
-    image_input.tell_times(source.clock)
+    image_input.print_times(source.clock)
     return replace(found, own_stamps=of_bag or (path.is_dir() and args.rate is None), imu=imu)
 
 
@@ -262,7 +262,7 @@ def _detected(args: Options, shots: Iterator[Shot | Carried]) -> _Input:
         frames.append((found.points, found.pixels, found.ids))
     shown = sum(len(image.points) > 0 for image in images)
     print(f"{shown} of {len(images)} images show the map")
-    image_input.tell_left_out(refused, {})
+    image_input.print_left_out(refused, {})
     for fault in (sizes.fault(), detector.mistake):
         if fault:
             print(f"warning: {fault}", file=sys.stderr)
@@ -407,7 +407,7 @@ def _calibrate_rig(args: Options) -> dict[str, Figures]:
                 f"rotation, place and offset are {times} times that"
             )
         if len(args.recordings) == 1 and is_bag(args.recordings[0]):
-            _tell_tf(args.recordings[0], mounted, cameras[name].frame, cameras[first].frame)
+            _compare_with_tf(args.recordings[0], mounted, cameras[name].frame, cameras[first].frame)
     refusals = {name: text for name, one in rig.items() if (text := one.undetermined)}
     if args.out is not None and not refusals:
         frames = {name: own.frame for name, own in cameras.items()}
@@ -433,7 +433,7 @@ def _without_k3(camera: Camera) -> Camera:
     return replace(camera, D=np.r_[camera.D, np.zeros(4)][:4])
 
 
-def _tell_tf(path: Path, found: Mounted, own: str, first: str) -> None:
+def _compare_with_tf(path: Path, found: Mounted, own: str, first: str) -> None:
     """Print how TF of a bag differs from a camera's estimated pose in the first one's frame."""
     with open_bag(path) as bag:
         given = transform_between(bag, own, first)

@@ -149,7 +149,7 @@ def main(
     except Exception as error:
         if common.verbose:
             traceback.print_exc()
-        code = _said(name, error)
+        code = _report_error(name, error)
         if code is None:
             raise
         return code
@@ -221,7 +221,7 @@ def _listed(names: Iterable[str]) -> str:
     )
 
 
-def _said(name: str, error: Exception) -> int | None:
+def _report_error(name: str, error: Exception) -> int | None:
     """Print what went wrong and return the exit code; None for a fault in the program."""
     match error:
         case BrokenPipeError():  # nobody reads any more

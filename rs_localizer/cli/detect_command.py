@@ -16,10 +16,10 @@ from rs_localizer.cli import WORKING, earlier_result
 from rs_localizer.cli.image_input import (
     ImageOptions,
     opened,
+    print_left_out,
+    print_telemetry,
+    print_times,
     shutter_values,
-    tell_left_out,
-    tell_telemetry,
-    tell_times,
 )
 from rs_localizer.cli.marker_map import TargetOptions, find_map
 from rs_localizer.cli.options import UsageError, argument, option
@@ -102,16 +102,16 @@ def detect(args: Options) -> Figures:
                     options = offline.DetectionOptions(args.with_images, of.scan_direction, name)
                     found = detect_in(shots, bag, options, bar)
                 every.append(_figures(args, found))
-                print(f"{f'{args.out}, {name}' if name else args.out}: {_said(args, found)}")
+                print(f"{f'{args.out}, {name}' if name else args.out}: {_summary(args, found)}")
                 print("".join(f"note {note}\n" for note in found.notes), end="")
-                tell_left_out(found.refused, found.carried)
+                print_left_out(found.refused, found.carried)
                 for fault in found.faults:
                     print(f"warning: {fault}")
-                tell_times(source.clock, of.readout_time, found.period)
+                print_times(source.clock, of.readout_time, found.period)
                 warnings += found.faults
         if values := {**of_map, **shutter_values(args)}:
             write_parameters(out / PARAMETERS, values)
-    tell_telemetry(args)
+    print_telemetry(args)
     merged = {key: _WORST[key](each[key] for each in every) for key in every[0]}
     return {**merged, "warnings": "; ".join(warnings)}
 
@@ -132,7 +132,7 @@ def _figures(args: Options, found: Extraction) -> Figures:
     return figures
 
 
-def _said(args: Options, found: Extraction) -> str:
+def _summary(args: Options, found: Extraction) -> str:
     kind = f"keypoints ({args.features})" if args.features else "corners"
     median = f"{np.median(found.counts):.0f} {kind} each (median)"
     said = f"{len(found.counts)} of {found.images} images, {median}"

@@ -104,7 +104,7 @@ def _can_read() -> bool:
     return all(importlib.util.find_spec(name) is not None for name in ("telemetry_parser", "av"))
 
 
-def tell_telemetry(args: ImageOptions, used: float | None = None) -> None:
+def print_telemetry(args: ImageOptions, used: float | None = None) -> None:
     """Say what a video knows of its camera, and which of it is not used.
 
     Args:
@@ -137,7 +137,7 @@ def tell_telemetry(args: ImageOptions, used: float | None = None) -> None:
     print(f"{telemetry.camera}: {', '.join(said)}")
 
 
-def tell_left_out(refused: Mapping[str, str], carried: Mapping[str, int]) -> None:
+def print_left_out(refused: Mapping[str, str], carried: Mapping[str, int]) -> None:
     """Print images that could not be used, and other messages that are kept."""
     for detail in refused.values():
         print(f"images that cannot be used are left out, the first one because {detail}")
@@ -146,7 +146,7 @@ def tell_left_out(refused: Mapping[str, str], carried: Mapping[str, int]) -> Non
         print(f"kept for replay: {kept}")
 
 
-def tell_times(clock: ImageClock | None, readout_time: float = 0.0, period: float = 0.0) -> None:
+def print_times(clock: ImageClock | None, readout_time: float = 0.0, period: float = 0.0) -> None:
     """Say where the times of the images come from, and what speaks against them.
 
     Args:

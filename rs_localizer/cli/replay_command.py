@@ -227,11 +227,11 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
             tqdm(total=tally.total, unit="frame", desc="replay", disable=None) as bar,
         ):
             built.mkdir()
-            _hint(path, options.params)
+            _hint_at_settings(path, options.params)
             smooth = _smoothing(localizer, options.pose_rate) if options.smooth else None
             tally.done = bar.update
             write_results(bag, topics, localizer, tally, built, smooth)
-        _tell(tally, config, out, timed)
+        _print_summary(tally, config, out, timed)
         if tally.table is not None and options.parquet is not None:
             _write_table([tally.table.table()], options.parquet)
         if not tally.localized:
@@ -252,13 +252,13 @@ def _write_table(tables: list[Table], file: Path) -> None:
     print(f"written to {file}: {rows} rows, one a frame")
 
 
-def _hint(bag: Path, params: Path | None) -> None:
+def _hint_at_settings(bag: Path, params: Path | None) -> None:
     file = (bag if bag.is_dir() else bag.parent) / "parameters.yaml"
     if params is None and file.is_file():
         print(f"the recording has settings of its own: --params {shlex.quote(str(file))}")
 
 
-def _tell(tally: Tally, config: NodeConfig, out: Path, timed: bool) -> None:
+def _print_summary(tally: Tally, config: NodeConfig, out: Path, timed: bool) -> None:
     print("\n".join(summary(tally, config, timed)))
     if tally.localized and not tally.moving:
         why = f"solver {config.solver} estimates no velocities"

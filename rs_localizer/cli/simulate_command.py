@@ -244,7 +244,7 @@ def run(args: Options) -> dict[str, object]:
     recorder = _Recorder(args)
     with atomic_directory(args.out, earlier_result(args, "metadata.yaml")) as built:
         recorder.write(built)
-    return _tell(args, recorder.world, recorder.stamps, recorder.counts)
+    return _print_result(args, recorder.world, recorder.stamps, recorder.counts)
 
 
 class _Recorder:
@@ -327,7 +327,7 @@ class _Recorder:
         return rig_parameters(parts)
 
 
-def _tell(
+def _print_result(
     args: Options, world: Scene | Array, stamps: list[int], counts: list[int]
 ) -> dict[str, object]:
     """Say what was written, and what comes next."""

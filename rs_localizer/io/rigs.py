@@ -65,7 +65,7 @@ def read_camchain(path: Path | str) -> RigParts:
     with calibration_faults(path := Path(path), "YAML or JSON", "no usable rig"):
         tree = load_yaml(read_text(path))
         own = [parameters for _, parameters in parameter_blocks(tree)]
-        return _own(own[0]) if own else _camchain(tree)
+        return _read_own_rig(own[0]) if own else _camchain(tree)
 
 
 def mounted_lenses(parts: RigParts) -> dict[str, Any]:
@@ -77,7 +77,7 @@ def mounted_lenses(parts: RigParts) -> dict[str, Any]:
     }
 
 
-def _own(tree: Any) -> RigParts:
+def _read_own_rig(tree: Any) -> RigParts:
     values = dict(flat(tree))
     cameras, poses, offsets = {}, {}, {}
     for name in values["cameras"]:

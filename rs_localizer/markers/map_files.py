@@ -73,29 +73,29 @@ def read_any(path: Path, kind: Family | None = None) -> tuple[MarkerMap, str]:
         if not name:
             raise ValueError(f"its format is not known ({', '.join(FORMATS)}): it has {file.names}")
         if name in (OWN, _KALIBR):
-            return (_own if name == OWN else _aprilgrid)(file), name
-        kind = kind or family(file.take(_TAG_FAMILY, str, USUAL_FAMILY.name))
+            return (_read_own_map if name == OWN else _aprilgrid)(file), name
+        kind = kind or family(file.value(_TAG_FAMILY, str, USUAL_FAMILY.name))
         return MarkerMap(tuple(_bundle(file, kind.name))), name
     except ValueError as error:
         raise MarkerMapError(f"{path}: {error}") from error
 
 
-def _own(file: _Entry) -> MarkerMap:
+def _read_own_map(file: _Entry) -> MarkerMap:
     markers = [_marker(item) for item in file.entries("markers", "marker")]
     boards = [_board(item) for item in file.entries("boards", "board")]
-    frame = file.take("map_frame", str)
+    frame = file.value("map_frame", str)
     file.finish()
     return MarkerMap(tuple(markers), tuple(boards), frame)
 
 
 def _marker(entry: _Entry) -> Marker:
-    name, number = entry.take("family", str), entry.take("id", int)
+    name, number = entry.value("family", str), entry.value("id", int)
     entry.where += f" ({name} {number})"
     with entry.named():
-        known = [entry.take(f"{of}_deviation", list, None) for of in ("position", "rotation")]
+        known = [entry.value(f"{of}_deviation", list, None) for of in ("position", "rotation")]
         deviations = None if known == [None, None] else finite(known, (2, 3), "deviations").ravel()
-        corners = entry.take("corners", list, None)
-        size = entry.take("size", _NUMBER, *(() if corners is None else (None,)))
+        corners = entry.value("corners", list, None)
+        size = entry.value("size", _NUMBER, *(() if corners is None else (None,)))
         if corners is None:
             pose = _pose(entry)
             entry.finish()
@@ -108,21 +108,24 @@ def _marker(entry: _Entry) -> Marker:
 
 
 def _board(entry: _Entry) -> Board:
-    kind = entry.take("type", str)
+    kind = entry.value("type", str)
     entry.where += f" ({kind})"
     with entry.named():
         if kind not in _BOARDS:
             raise ValueError(f"type must be one of {', '.join(_BOARDS)}")
-        counts = entry.take("columns", int), entry.take("rows", int)
-        square = float(entry.take("square", _NUMBER))
+        counts = entry.value("columns", int), entry.value("rows", int)
+        square = float(entry.value("square", _NUMBER))
         given = {
             "pose": _pose(entry),
-            "shape": entry.take("shape", list, None),
-            "deviation": entry.take("deviation", _NUMBER, None),
+            "shape": entry.value("shape", list, None),
+            "deviation": entry.value("deviation", _NUMBER, None),
         }
         if kind == _CHARUCO:
-            marker, name = float(entry.take("marker", _NUMBER)), entry.take("family", str)
-            own = entry.take("first_id", int, 0), entry.take("legacy", bool, False)
+            marker, name = (
+                float(entry.value("marker", _NUMBER)),
+                entry.value("family", str),
+            )
+            own = entry.value("first_id", int, 0), entry.value("legacy", bool, False)
             entry.finish()
             return Charuco(*counts, square, marker, family(name), *own, **given)
         entry.finish()
@@ -130,19 +133,22 @@ def _board(entry: _Entry) -> Board:
 
 
 def _pose(entry: _Entry) -> Pose:
-    position, rotation = entry.take("position", list), entry.take("rotation", list, None)
+    position, rotation = (
+        entry.value("position", list),
+        entry.value("rotation", list, None),
+    )
     if rotation is None:
-        return Pose(position, rotation_of_quaternion(entry.take("quaternion", list)))
+        return Pose(position, rotation_of_quaternion(entry.value("quaternion", list)))
     if "quaternion" in entry:
         raise ValueError("there are both a rotation and a quaternion")
     return Pose(position, rotation)
 
 
 def _aprilgrid(entry: _Entry) -> MarkerMap:
-    if (kind := entry.take("target_type", str)) != "aprilgrid":
+    if (kind := entry.value("target_type", str)) != "aprilgrid":
         raise ValueError(f"target_type must be aprilgrid, not {kind!r}; of a chessboard: --board")
-    columns, rows = entry.take("tagCols", int), entry.take("tagRows", int)
-    size, gap = entry.take("tagSize", _NUMBER), entry.take("tagSpacing", _NUMBER)
+    columns, rows = entry.value("tagCols", int), entry.value("tagRows", int)
+    size, gap = entry.value("tagSize", _NUMBER), entry.value("tagSpacing", _NUMBER)
     name, pitch = FAMILIES["apriltag_36h11_border2"].name, size * (1.0 + gap)
     return MarkerMap(tuple(
         Marker.at(name, k, size, Pose(np.array([
@@ -154,7 +160,7 @@ def _aprilgrid(entry: _Entry) -> MarkerMap:
 
 def _bundle(file: _Entry, name: str) -> Iterator[Marker]:
     bundles = {
-        str(bundle.take("name", (str, int), f"{index}")): bundle
+        str(bundle.value("name", (str, int), f"{index}")): bundle
         for index, bundle in enumerate(file.entries("tag_bundles", "bundle"))
     }
     if not bundles:
@@ -166,9 +172,9 @@ def _bundle(file: _Entry, name: str) -> Iterator[Marker]:
         )
     (chosen,) = bundles.values()
     for tag in chosen.entries("layout", "tag"):
-        number, size = tag.identify("id"), float(tag.take("size", _NUMBER))
+        number, size = tag.identify("id"), float(tag.value("size", _NUMBER))
         place, turn = tag.numbers("xyz"), tag.numbers(("qx", "qy", "qz"))
-        turn.append(float(tag.take("qw", _NUMBER, 1.0)))
+        turn.append(float(tag.value("qw", _NUMBER, 1.0)))
         with tag.named():
             pose = Pose(np.array(place), rotation_of_quaternion(turn))
             yield Marker.at(name, number, size, pose)
@@ -273,7 +279,7 @@ class _Entry:
         """The keys that are left."""
         return ", ".join(map(str, self._left)) or "nothing else"
 
-    def take(self, name: str, kind: type | tuple[type, ...], *default: Any) -> Any:
+    def value(self, name: str, kind: type | tuple[type, ...], *default: Any) -> Any:
         if name not in self._left:
             if default:
                 return default[0]
@@ -285,16 +291,16 @@ class _Entry:
 
     def identify(self, name: str) -> int:
         """Return the id of a tag, and note it for the messages of errors."""
-        number: int = self.take(name, int)
+        number: int = self.value(name, int)
         self.where += f" (id {number})"
         return number
 
     def numbers(self, names: Iterable[str]) -> list[float]:
         """Return numbers by their names; a missing one is 0."""
-        return [float(self.take(name, _NUMBER, 0.0)) for name in names]
+        return [float(self.value(name, _NUMBER, 0.0)) for name in names]
 
     def entries(self, name: str, one: str) -> list[_Entry]:
-        listed = self.take(name, (list, type(None)), None) or []
+        listed = self.value(name, (list, type(None)), None) or []
         return [_Entry(item, f"{one} {index + 1}") for index, item in enumerate(listed)]
 
     def finish(self) -> None:

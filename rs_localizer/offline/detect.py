@@ -137,7 +137,7 @@ def _readable(
             found.refused.setdefault(shot.image.reason, shot.image.detail)
         else:
             found.stamps_ns.append(shot.image.stamp_ns)
-            camera = cameras.of(shot, shot.image)
+            camera = cameras.camera_of(shot, shot.image)
             if isinstance(camera, Refusal):
                 found.refused.setdefault(camera.reason, camera.detail)
             else:
@@ -228,7 +228,7 @@ class Cameras:
         self._fit = 0  # images of the size of their calibration
         self._misfit, self._fault = 0, ""  # images of another one, and what the first of them is
 
-    def of(self, shot: Shot, image: Image) -> Camera | Refusal:
+    def camera_of(self, shot: Shot, image: Image) -> Camera | Refusal:
         """Camera of one image; refused where it is of another size than those that fit.
 
         Raises:
@@ -285,7 +285,7 @@ def seen_by(
         if isinstance(image, Refusal):
             refused.setdefault(image.reason, image.detail)
             continue
-        camera = None if shot.camera_info is None else cameras.of(shot, image)
+        camera = None if shot.camera_info is None else cameras.camera_of(shot, image)
         if isinstance(camera, Refusal):
             refused.setdefault(camera.reason, camera.detail)
             continue

@@ -70,7 +70,7 @@ class Input:
     use: Callable[[Any, Any], Results]
     refused: Reason
     read: Callable[[Any], Any] = _as_it_is
-    said: str = ""  # what a user is told that is missing
+    in_words: str = ""  # what a user is told that is missing
     necessary: bool = False  # without it no frame can be localized
     needs: str = ""  # of frames: the input that has to come first, and that only they use
     latched: bool = False  # who comes late wants the last message, too
@@ -108,7 +108,7 @@ _ROWS = (
         read=read_camera_info,
         use=lambda localizer, calibration: localizer.calibrate(calibration),
         refused=Reason.BAD_CAMERA_INFO,
-        said="camera_info",
+        in_words="camera_info",
         necessary=True,
         latched=True,
     ),
@@ -120,7 +120,7 @@ _ROWS = (
         read=read_map,
         use=lambda localizer, landmarks: localizer.use_map(landmarks),
         refused=Reason.BAD_MAP,
-        said="a map",
+        in_words="a map",
         latched=True,
         lasting=True,
     ),
@@ -170,10 +170,10 @@ def input_named(name: str) -> Input:
     return INPUTS[name.rpartition("/")[2]]
 
 
-def said(name: str) -> str:
+def input_in_words(name: str) -> str:
     """Words for a user whom an input lacks."""
     camera, _, own = name.rpartition("/")
-    return f"{INPUTS[own].said} of {camera}" if camera else INPUTS[own].said
+    return f"{INPUTS[own].in_words} of {camera}" if camera else INPUTS[own].in_words
 
 
 def with_role(role: Role) -> list[Input]:

@@ -309,12 +309,12 @@ def _judged(
         blocks_of(camera, observations, fitted, 2),
     )
     formal, share = fitted.readout_time_deviation, _interval_share(fitted, stamps)
-    values = _of(blocks, "readout_time")
+    values = _values_of(blocks, "readout_time")
     # Of images that are missing where stamps are even, each part has a share of its own.
-    deviations = np.hypot(_of(blocks, "deviation"), share * values)
+    deviations = np.hypot(_values_of(blocks, "deviation"), share * values)
     inflation, mount = disagreement(values, deviations), None
     if observations.gyro is not None:
-        doubt = disagreement(_of(blocks, "delay"), _of(blocks, "delay_deviation"))
+        doubt = disagreement(_values_of(blocks, "delay"), _values_of(blocks, "delay_deviation"))
         mount = mount_of(camera, fitted, observations.gyro, doubt)
     at = slice(1, 1 + len(fitted.state.lens))
     lens = lens_errors(fitted.camera, inflation**2 * fitted.border_covariance[at, at])
@@ -345,7 +345,7 @@ def _judged(
     )
 
 
-def _of(blocks: tuple[Block, ...], name: str) -> Array:
+def _values_of(blocks: tuple[Block, ...], name: str) -> Array:
     return np.array([getattr(block, name) for block in blocks])
 
 

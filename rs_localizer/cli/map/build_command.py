@@ -15,10 +15,10 @@ from rs_localizer.cli import WORKING, earlier_result, stage
 from rs_localizer.cli.image_input import (
     ImageOptions,
     opened,
+    print_left_out,
+    print_telemetry,
+    print_times,
     shutter_values,
-    tell_left_out,
-    tell_telemetry,
-    tell_times,
 )
 from rs_localizer.cli.options import UsageError, argument, number, option
 from rs_localizer.cli.typed import typed
@@ -64,8 +64,8 @@ def look_at_images(args: Options, points: Sequence[_Point], looker: Looker) -> L
     for name, seconds, *_ in points:
         if seconds not in looked.moments:
             raise UsageError(f"--point {name}: the images end before {seconds:g} s")
-    tell_left_out(looked.refused, {})
-    tell_times(source.clock, build(shutter_values(args)).readout_time, looked.period)
+    print_left_out(looked.refused, {})
+    print_times(source.clock, build(shutter_values(args)).readout_time, looked.period)
     return looked
 
 
@@ -101,7 +101,7 @@ def run(args: Options) -> None:
     if not args.recording.exists():
         raise ValueError(f"{args.recording} does not exist")
     markers = None if args.markers is None else read_checked_map(args.markers)
-    tell_telemetry(args)
+    print_telemetry(args)
     shutter, frame = shutter_of(args), MAP_FRAME if markers is None else markers.map_frame
     with atomic_directory(args.out, earlier_result(args, MAP)) as out:
         out.mkdir()
@@ -117,7 +117,7 @@ def run(args: Options) -> None:
             folder.mkdir()
             built = build_map(inputs, Workshop(folder, Effort(), stage))
         _write(out, built, looked)
-    _tell(args, built, looked)
+    _print_result(args, built, looked)
 
 
 def _points(options: Options) -> list[_Point]:
@@ -170,7 +170,7 @@ def _write(out: Path, built: Built, looked: Looked) -> None:
     (out / REPORT).write_text(written(built, looked.images, looked.views), encoding="utf-8")
 
 
-def _tell(args: Options, built: Built, looked: Looked) -> None:
+def _print_result(args: Options, built: Built, looked: Looked) -> None:
     print(args.out / MAP)
     for name, text in rows(built, looked.images, len(looked.views)):
         print(f"  {name:30} {text}")

@@ -89,7 +89,7 @@ def run(args: Options) -> None:
     freedom = MapFreedom(not known, args.intrinsics, deviations)
     refined = refine_rig(rig, localized.seen, localized.start, freedom, done=_step)
     names = [of.name for of in cameras]
-    _tell(localized, refined, names)
+    _print_result(localized, refined, names)
     for name, result in zip(names, refined.cameras, strict=True):
         check_readout(result.readout_check, name)
     _write(args, args.out, localized.landmarks, refined, names)
@@ -125,7 +125,7 @@ def _deviations(args: Options, landmarks: Map, map_deviation: float) -> Array | 
     return np.where(np.isin(landmarks.ids, args.hold), _HOLD, every)
 
 
-def _tell(localized: RecordedMap, refined: RefinedMap, names: Sequence[str]) -> None:
+def _print_result(localized: RecordedMap, refined: RefinedMap, names: Sequence[str]) -> None:
     moved = np.linalg.norm(refined.points - localized.start.points, axis=1)[refined.refined]
     spread = np.sqrt(np.trace(refined.covariances[refined.refined], axis1=1, axis2=2))
     rows = {
@@ -200,7 +200,7 @@ def _undo_shutter(args: Options, folder: Path, out: Path) -> None:
         check_readout(result.readout_check)
         built.mkdir()
         write_model(built, result.camera, result.images, result.points)
-    _tell_model(result, len(model.images), len(model.points))
+    _print_model(result, len(model.images), len(model.points))
     print(f"written: {out}")
 
 
@@ -229,7 +229,7 @@ def image_stamps(names: list[str], rate: float | None) -> dict[str, int]:
     return stamps
 
 
-def _tell_model(result: GlobalShutterModel, images: int, points: int) -> None:
+def _print_model(result: GlobalShutterModel, images: int, points: int) -> None:
     kept, shutter = sum(len(image.points) for image in result.images.values()), result.camera
     _print({
         "images with a pose": f"{len(result.images)} of {images}",

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, refuse_existing, write_all
-from rs_localizer.cli.image_input import ImageOptions, opened, tell_left_out, tell_times
+from rs_localizer.cli.image_input import ImageOptions, opened, print_left_out, print_times
 from rs_localizer.cli.map import check_readout
 from rs_localizer.cli.options import UsageError, argument, option
 from rs_localizer.cli.rig_input import MapCamera, map_cameras, mounting_lines
@@ -68,7 +68,7 @@ def run(args: Options) -> None:
     filmed = [_filmed(camera, spotter) for camera in cameras]
     found = survey(filmed, markers, origin=origin)
     every = found.deviations_of_shape
-    _tell(found, every, cameras, filmed)
+    _print_result(found, every, cameras, filmed)
     for camera, result in zip(cameras, found.cameras, strict=True):
         check_readout(result.readout_check, camera.name)
     pairs = zip(found.markers, every, strict=True)
@@ -118,8 +118,8 @@ def _filmed(given: MapCamera[Options], spotter: Spotter) -> Filmed:
                 raise ValueError("camera_info changes within the recording; cut it there")
             camera, stamp = own, image.stamp_ns
             spotted[stamp] = spotter.spot(image.pixels, stamp)
-    tell_left_out(refused, {})
-    tell_times(source.clock)
+    print_left_out(refused, {})
+    print_times(source.clock)
     if camera is None:
         raise ValueError(f"{args.recording} has no image that can be read")
     every = [spotted[stamp] for stamp in sorted(spotted)]
@@ -127,7 +127,7 @@ def _filmed(given: MapCamera[Options], spotter: Spotter) -> Filmed:
     return Filmed(camera, config.stamp_offset, given.mounting, every)
 
 
-def _tell(
+def _print_result(
     found: Survey, every: Array, cameras: Sequence[MapCamera[Options]], filmed: Sequence[Filmed]
 ) -> None:
     """Print the table of the markers, with their deviations (m,6)."""
@@ -158,7 +158,7 @@ def _tell(
         name = marker.name.removeprefix("marker ")
         mark = " poor" if poor else ""
         print(f"{name:26} {sights:6} {x:9.4f} {y:9.4f} {z:9.4f} {place:8.2f} {turn:8.3f}{mark}")
-    _tell_frame(found)
+    _print_frame(found)
     if found.poor.any():
         poor = tuple(found.markers[k] for k in np.flatnonzero(found.poor))
         print(f"warning: known to worse than a tenth of their size: {_listed(poor)}")
@@ -175,7 +175,7 @@ def _tell(
         )
 
 
-def _tell_frame(found: Survey) -> None:
+def _print_frame(found: Survey) -> None:
     """Print the effect of the origin's own errors on all other poses in its frame."""
     origin = found.markers[0]
     turn = np.degrees(np.linalg.norm(found.deviations_of_shape[0, 3:]))

@@ -14,7 +14,7 @@ from rs_localizer.io.messages import make_header
 from rs_localizer.io.outputs import Localized
 from rs_localizer.pipeline.camera_frames import DOUBTFUL
 from rs_localizer.pipeline.imu_readings import ImuState, in_words
-from rs_localizer.pipeline.inputs import Role, input_named, said
+from rs_localizer.pipeline.inputs import Role, input_in_words, input_named
 from rs_localizer.pipeline.map_to_odom import Decision, Standing
 from rs_localizer.pipeline.refusal import IMU_REASONS
 from rs_localizer.ros.node.conversion import make_message
@@ -195,7 +195,7 @@ def _judge(condition: Condition, summary: Summary) -> Health:
     silent = _silent_frames(condition)
     if condition.missing:
         level = Level.WARN if silent else Level.ERROR
-        what = " and ".join(said(name) for name in condition.missing)
+        what = " and ".join(input_in_words(name) for name in condition.missing)
         causes = [f"{it.topic}: {it.cause}" for it in condition.silence.values() if it.cause]
         for reason in (input_named(name).refused for name in condition.missing):
             if count := summary.reasons.get(reason):

@@ -138,7 +138,7 @@ def look_through(
         if isinstance(image, Refusal):
             found.refused.setdefault(image.reason, image.detail)
             continue
-        camera = None if shot.camera_info is None else cameras.of(shot, image)
+        camera = None if shot.camera_info is None else cameras.camera_of(shot, image)
         if isinstance(camera, Refusal):
             found.refused.setdefault(camera.reason, camera.detail)
             continue
