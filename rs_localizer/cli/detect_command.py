@@ -82,7 +82,7 @@ def run(args: Options) -> Figures:
 
 def detect(args: Options) -> Figures:
     """Detect in the images of one recording, of each camera of a rig, and say what came of it."""
-    of_map, detect_in = _of_markers(args) if args.features is None else _of_features(args)
+    of_map, detect_images = _of_markers(args) if args.features is None else _of_features(args)
     settings, every, warnings = build(shutter_values(args)), list[Figures](), list[str]()
     with atomic_directory(args.out, earlier_result(args, "metadata.yaml")) as out:
         with BagWriter(out) as bag:
@@ -100,7 +100,7 @@ def detect(args: Options) -> Figures:
                     if name not in ("", settings.cameras[0]):  # what goes along is of the first
                         shots = (shot for shot in shots if not isinstance(shot, Carried))
                     options = offline.DetectionOptions(args.with_images, of.scan_direction, name)
-                    found = detect_in(shots, bag, options, bar)
+                    found = detect_images(shots, bag, options, bar)
                 every.append(_figures(args, found))
                 print(f"{f'{args.out}, {name}' if name else args.out}: {_summary(args, found)}")
                 print("".join(f"note {note}\n" for note in found.notes), end="")
@@ -141,17 +141,17 @@ def _summary(args: Options, found: Extraction) -> str:
     return said
 
 
-DetectIn = Callable[["Shots", BagWriter, "offline.DetectionOptions", Any], "Extraction"]
+Detection = Callable[["Shots", BagWriter, "offline.DetectionOptions", Any], "Extraction"]
 
 
-def _of_markers(args: Options) -> tuple[Mapping[str, float], DetectIn]:
+def _of_markers(args: Options) -> tuple[Mapping[str, float], Detection]:
     if args.max_keypoints is not None:
         raise UsageError("--max-keypoints goes with --features")
     if args.map is None and args.board is None:
         raise UsageError("give --map, --board or --features")
     marker_map, config = find_map(args), DetectorConfig()
 
-    def detect_in(
+    def detect_images(
         shots: Shots, bag: BagWriter, options: offline.DetectionOptions, bar: Any
     ) -> Extraction:
         notices: Counter[str] = Counter()
@@ -164,19 +164,19 @@ def _of_markers(args: Options) -> tuple[Mapping[str, float], DetectIn]:
         found.notes = tuple(f"({number} images): {text}" for text, number in texts)
         return found
 
-    return marker_map.settings, detect_in
+    return marker_map.settings, detect_images
 
 
-def _of_features(args: Options) -> tuple[Mapping[str, float], DetectIn]:
+def _of_features(args: Options) -> tuple[Mapping[str, float], Detection]:
     for name in ("map", "board", "square"):
         if getattr(args, name) is not None:
             raise UsageError(f"--{name} is for markers; give it or --features")
     most = args.max_keypoints or FeatureConfig().max_keypoints
     extractor = FrameExtractor(FeatureConfig(features=args.features or "", max_keypoints=most))
 
-    def detect_in(
+    def detect_images(
         shots: Shots, bag: BagWriter, options: offline.DetectionOptions, bar: Any
     ) -> Extraction:
         return record_features(shots, extractor, bag, options, bar.update)
 
-    return {}, detect_in
+    return {}, detect_images
