@@ -437,7 +437,7 @@ class Tracker:
         context: FrameContext,
         find: Callable[[Prior | None, GyroRotation | None], Estimate | Failure],
     ) -> tuple[Estimate | Failure, Prior | None]:  # fmt: skip
-        """The frame beside what a gyroscope knows, or without what its points contradict.
+        """Find the frame beside what a gyroscope knows, or without what its points contradict.
 
         Returns:
             what was found, and the prior that it was found with.
@@ -456,7 +456,7 @@ class Tracker:
         return (other, alone) if other else (found, prior)
 
     def _told(self, found: Estimate, prior: Prior | None, foreseen: GyroPrediction) -> MotionSample:
-        """What its points tell of the motion of a frame beside a gyroscope's turn."""
+        """Return what the points of a frame tell of its motion beside a gyroscope's turn."""
         near = prior if found.tracked else None
         known = self.localizer.known_of(near, found.span, found.turn)
         told = told_of(found, known)

@@ -144,7 +144,7 @@ def _unshaken(motion: Numbers, shake: Array2, joint: Array2) -> tuple[Numbers, A
 
 
 def mean_turn(turn: GyroRotation) -> tuple[Array, Array]:
-    """Mean rate (3,) of a known turn and a covariance (18,18), for a camera that goes on alone.
+    """Return the mean rate (3,) of a known turn and a covariance (18,18), to go on without it.
 
     How much the rate changed within the readout, a gyroscope knows it to change in the next.
     """

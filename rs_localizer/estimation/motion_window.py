@@ -405,7 +405,7 @@ def motion_of(gaussian: Gaussian, span: float) -> tuple[Motion, Array]:
 
 
 def told_of(estimate: Estimate, known: PriorTerms) -> MotionSample:
-    """What the points of an estimate tell of its motion, per readout, beside its known turn.
+    """Return what the points of an estimate tell of its motion, per readout, beside its turn.
 
     ``known`` is what was known of that motion before, in the map's frame.
     """

@@ -119,7 +119,7 @@ class GyroPrediction:
         return self.rotation.known
 
     def of(self, last: Estimate) -> Estimate:
-        """The estimate that it makes of the last frame's."""
+        """Return the estimate that it makes of the last frame's."""
         assert self.foreseen is not None
         motion, turn = self.foreseen.motion, self.turn
         numbers = {each.name: getattr(motion, each.name) for each in fields(Motion)}
@@ -131,7 +131,7 @@ class GyroPrediction:
 
 
 class GyroscopeTrack:
-    """The gyroscope of one camera beside its track.
+    """The track of what the gyroscope of one camera is off by.
 
     Args:
         settings: what is known of it.
@@ -168,12 +168,12 @@ class GyroscopeTrack:
         self._tied, self._age = np.zeros((PARAMETERS, ERRORS)), 0
 
     def snapshot(self) -> GyroscopeTrack:
-        """What :meth:`ahead` knows now: frames that come later do not change it."""
+        """Return a copy for :meth:`ahead`, which frames that come later do not change."""
         return copy(self)
 
     @property
     def status(self) -> InertialStatus:
-        """State of the gyroscope after the last frame."""
+        """The gyroscope after the last frame."""
         errors = self.errors
         variances = errors.covariance.diagonal()
         return InertialStatus(
@@ -183,7 +183,7 @@ class GyroscopeTrack:
 
     @property
     def agreed(self) -> bool:
-        """Agreement of the last frame with the gyroscope."""
+        """Whether the last frame agreed with the gyroscope."""
         return self._unused is None
 
     def last_ns(self, samples: ImuSamples) -> int:
@@ -193,7 +193,7 @@ class GyroscopeTrack:
     def foresee(
         self, samples: ImuSamples | None, middle_ns: int, last: Before | None
     ) -> GyroPrediction | None:
-        """What it says of a frame before its points; None: its samples do not cover the frame.
+        """Return what it says of a frame before its points; None: samples do not cover the frame.
 
         Args:
             middle_ns: exposure of the middle row.
@@ -207,17 +207,17 @@ class GyroscopeTrack:
         if samples is None or len(samples) == 0:
             self.forget_motion()
             return None
-        found = self.ahead(samples, middle_ns, last)
-        if found is None or found.foreseen is None:
-            self.forget_motion()
+        found = None if last is None else self.ahead(samples, middle_ns, last)
+        if found is not None:
+            return found
+        self.forget_motion()
+        found = self.ahead(samples, middle_ns, None) or self._strayed(samples, middle_ns)
         if found is None:
-            found = self.ahead(samples, middle_ns, None) or self._strayed(samples, middle_ns)
-            if found is not None:
-                found = replace(found, prior=self._gravity(samples, middle_ns))
-        return found
+            return None
+        return replace(found, prior=self._gravity(samples, middle_ns))
 
     def _strayed(self, samples: ImuSamples, middle_ns: int) -> GyroPrediction | None:
-        """What it says from the beginning on, if a delay that is hardly known leads elsewhere."""
+        """Begin anew, if a delay that is hardly known leads away from the samples."""
         known, before = self.errors.covariance[DELAY, DELAY], self._before_all[DELAY, DELAY]
         if known.item() < _HARDLY**2 * before.item():
             return None
@@ -225,15 +225,15 @@ class GyroscopeTrack:
         return self.ahead(samples, middle_ns, None)
 
     def forget_motion(self) -> None:
-        """The next frame does not follow the last one."""
+        """Forget how the last motion goes with what the gyroscope is off by."""
         self._tied = np.zeros((PARAMETERS, ERRORS))
 
     def ahead(
         self, samples: ImuSamples, middle_ns: int, last: Before | None
     ) -> GyroPrediction | None:
-        """Prediction of a moment after the last frame, as if it were a frame's.
+        """Return the prediction of a moment after the last frame, as if it were a frame's.
 
-        None unless samples cover it.
+        It is None if samples do not cover it.
         """
         since = None if last is None else last.middle_ns
         turned = rotated(samples, middle_ns, self._readout_time, self.errors, since)
@@ -253,7 +253,7 @@ class GyroscopeTrack:
         return Prior(gravity=seen[0], gravity_deviation=seen[1], gravity_in_map=up)
 
     def _carried(self, turned: Rotated, last: Before, seconds: float) -> _Foreseen:
-        """The motion after a turn, beside the one that the gyroscope knows of this frame."""
+        """Return the motion after a turn, beside the rotation within this frame."""
         assert turned.between is not None
         still = replace(last.motion, angular_velocity=np.zeros(3), angular_acceleration=np.zeros(3))
         later, transport = carried(numbers_of(still), seconds / self._readout_time, last.fading)
@@ -284,7 +284,7 @@ class GyroscopeTrack:
         )
 
     def agrees(self, prediction: GyroPrediction, found: Estimate, told: MotionSample) -> bool:
-        """Take in a frame: whether the camera's own rotation is the gyroscope's.
+        """Learn from a frame, and return whether the camera's own rotation is the gyroscope's.
 
         Args:
             found: the frame, with the gyroscope or without.
@@ -326,7 +326,7 @@ class GyroscopeTrack:
         self._tied = gain @ tied
 
     def _of_turn(self, turned: Rotated, told: MotionSample) -> _Foreseen:
-        """What it says of a frame that follows no other, near what its points tell."""
+        """Return what it says of a frame that follows no other, near what its points tell."""
         state = told.state
         motion = Motion(
             state[:9].reshape(3, 3), state[9:12], np.zeros(3), state[15:18],
@@ -339,7 +339,7 @@ class GyroscopeTrack:
         return _Foreseen(motion, covariance, tied)
 
     def _oddity(self) -> str:
-        """What it has that the settings hardly allow for, in words; empty: nothing."""
+        """Return in words what it has that the settings hardly allow for; empty: nothing."""
         said = [words(self.errors.mean[place]) for place, words in _WORDS if self._is_odd(place)]
         if self._former is not None:  # the delay may be another one since it is learned anew
             off = self.errors.time_offset - self._former.time_offset
@@ -349,7 +349,7 @@ class GyroscopeTrack:
         return " and ".join(said)
 
     def _is_odd(self, place: slice) -> bool:
-        """Whether numbers are certainly not zero, and more than their deviation."""
+        """Return whether numbers are certainly not zero, and more than their deviation."""
         off, known = self.errors.mean[place], self.errors.covariance[place, place]
         certain = off @ np.linalg.solve(known, off) > _CERTAIN[len(off)]
         return bool(certain and np.mean(off**2) > self._before_all[place.start, place.start])
@@ -372,7 +372,7 @@ _WORDS = ((SCALE, _scale), (MOUNT, _mount), (DELAY, _delay))
 
 
 def _swung(found: Estimate, turned: Rotated) -> float:
-    """Squared size of a vibration that points see beside a gyroscope, in deviations."""
+    """Return the squared size, in deviations, of a vibration that points see beside it."""
     if found.turn is None or not len(found.shake):
         return 0.0
     values, known = np.zeros((len(_ROWS), FUNCTIONS)), turned.known
@@ -398,7 +398,7 @@ def _is_positive(joint: Array) -> bool:
 
 
 def changed(samples: ImuSamples, seconds: float) -> float:
-    """Mean squared change of each axis' turn rate (rad/s)^2 in so many s, of late."""
+    """Return the mean squared change of the rates of an axis (rad/s)^2 in so many s, of late."""
     times = 1e-9 * (samples.times_ns - samples.times_ns[-1])
     late = times >= times[0] + seconds
     late &= times >= -_LATELY
@@ -410,7 +410,7 @@ def changed(samples: ImuSamples, seconds: float) -> float:
 
 
 def without_gyro(prior: Prior | None, turn: GyroRotation) -> Prior | None:
-    """Prediction of the camera alone, for a motion beside a known turn."""
+    """Return the prediction of the camera alone, for a motion beside a known turn."""
     if prior is None:
         return None
     assert prior.motion is not None

@@ -60,7 +60,7 @@ _MOST = 64
 
 
 def _densified(times: Array, rates: Array) -> tuple[Array, Array]:
-    """:func:`densified` for the last samples, which are the frame's."""
+    """Add samples between the last ones, which are the frame's."""
     late = max(len(times) - _MOST, 0)
     dense, found = densified(times[late:].copy(), rates[late:].copy())
     return np.concatenate([times[:late], dense]), np.concatenate([rates[:late], found])
@@ -144,13 +144,13 @@ class GyroscopeErrors:
         return float(self.mean[DELAY.start])
 
     def corrected(self, rates: Array) -> Array:
-        """Rates (n,3) of the camera by those that were read."""
+        """Return the rates (n,3) of the camera by those that were read."""
         shown = (rates - self.bias) / (1.0 + self.mean[SCALE])
         turned: Array = shown @ so3.exp(np.ascontiguousarray(self.mean[MOUNT])).T
         return np.ascontiguousarray(turned)
 
     def derivative(self, rate: Array) -> Array:
-        """Derivative (3,10) of a corrected rate (3,) by all but the delay."""
+        """Return the derivative (3,10) of a corrected rate (3,) by all but the delay."""
         mount, scale = so3.exp(np.ascontiguousarray(self.mean[MOUNT])), 1.0 + self.mean[SCALE]
         by_errors = np.zeros((3, PARAMETERS))
         by_errors[:, BIAS] = -mount / scale
@@ -176,7 +176,7 @@ def rotated(
     samples: ImuSamples, middle_ns: int, readout_time: float, errors: GyroscopeErrors,
     since_ns: int | None = None,
 ) -> Rotated | None:  # fmt: skip
-    """The rotation during a frame, and since a moment before; None if samples do not cover it.
+    """Return the rotation in a frame and since a moment before; None: samples do not cover it.
 
     Args:
         middle_ns: exposure of the middle row.
@@ -249,11 +249,11 @@ def rotated(
 def _averaged(
     times: Array, rates: Array, deviation: float, near: BoolArray
 ) -> tuple[Array, Array, Array]:
-    """Rates (n,3) averaged over a normal shift of their times (n,).
+    """Average rates (n,3) over a normal shift of their times (n,).
 
     Returns:
-        them; of those that are near, variances (3,) about the average, but for what goes with the
-        shift, and of the turns to and fro that these make.
+        averages; of those that are near, variances (3,) about the average, but for what goes with
+        the shift, and of the turns to and fro that these make.
     """
     weights = np.gradient(times) * np.exp(-0.5 * ((times[:, None] - times) / deviation) ** 2)
     weights /= weights.sum(axis=1)[:, None]
@@ -268,7 +268,7 @@ def _averaged(
 
 
 def _shown(times: Array, rates: Array, length: float, half: float, late: float) -> Array:
-    """What rates say (9,) if they come so much later.
+    """Return what rates say (9,) if they come so much later.
 
     That is the turn over a length until time 0, and mean rate and its change over a readout, of so
     much on both sides of it, per readout. Axes are those of each moment: how they turn meanwhile

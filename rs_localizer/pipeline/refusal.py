@@ -161,7 +161,7 @@ IMU_REASONS: dict[str, Meaning] = {
     ),
     ImuReason.NOT_TRACKING: Meaning("the solver is for global shutters", "another solver"),
     ImuReason.DOUBTED: Meaning(
-        "the image fits better without the gyroscope",
+        "the rotation within and before the image is not the gyroscope's",
         "if often: imu.gyroscope_noise, imu.time_offset",
     ),
     ImuReason.DISAGREES: Meaning(

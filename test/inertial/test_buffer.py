@@ -107,6 +107,9 @@ def test_the_end_of_the_range_is_noticed():
         # The peak of the sine lies at 1/12 s + k/3 s.
         found = buffer.between(START + 735 * MS, START + 765 * MS)
         assert lack(found) == expected
+        # Also where readings are wanted that have not come.
+        found = buffer.between(START + 735 * MS, START + 765 * MS, until_ns=START + 1500 * MS)
+        assert lack(found) == expected
         # While it turns through zero, the gyroscope tells the truth.
         assert lack(buffer.between(START + 650 * MS, START + 680 * MS)) is None
 
