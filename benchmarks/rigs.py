@@ -31,7 +31,7 @@ from rs_localizer.config import CalibrationErrors
 
 _CAMERA = Camera(focal=450.0)
 _POINTS = 152  # of all cameras
-_EXACT = rsl.LocalizerConfig(calibration=CalibrationErrors(0.0, 0.0, 0.0))
+_EXACT = rsl.LocalizerConfig(calibration=CalibrationErrors(0.0, 0.0, 0.0, 0.0))
 _UPRIGHT, _TURNED = np.eye(3), np.diag([-1.0, -1.0, 1.0])
 _ASIDE = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _REGION = float(chi2.ppf(0.95, 6))

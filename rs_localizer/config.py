@@ -171,6 +171,10 @@ class CalibrationErrors:
         "Standard deviation of the distortion at the corners of the image, in pixels",
         (0.0, 1000.0),
     )
+    # What calibrations of phones and webcams scatter by; it looks like a turn across the rows.
+    aspect_ratio: float = setting(
+        0.003, "Standard deviation of fy over fx, as a share of it", (0.0, 1.0)
+    )
 
     def __post_init__(self) -> None:
         check(self, "calibration.")

@@ -23,7 +23,12 @@ from rs_localizer.core.rig import Exposure, Rig, RigEstimate
 from rs_localizer.core.state import POSE
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.acceptance import noise_fills, refusal, speeding, uncertain
-from rs_localizer.estimation.calibration import NO_EFFECT, ErrorModes, calibration_effect
+from rs_localizer.estimation.calibration import (
+    NO_EFFECT,
+    ErrorModes,
+    calibration_effect,
+    widened,
+)
 from rs_localizer.estimation.hypotheses import frame_posterior
 from rs_localizer.estimation.left_out import LeftOut, left_out
 from rs_localizer.estimation.observations import (
@@ -430,5 +435,6 @@ class Localizer:
         if odd.failure is not None:
             return odd.failure
         predicted = own_terms is not observed.terms
+        effect = widened(effect, posterior)
         estimate = estimate_of(observed, posterior, best.samples, effect, predicted)
         return replace(estimate, left_out=odd.notice) if odd.notice else estimate

@@ -31,6 +31,7 @@ from rs_localizer.core.arrays import BoolArray, instance
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import ByCamera, Rig, RigEstimate
+from rs_localizer.core.scanning import ROW_BY_ROW
 from rs_localizer.core.state import (
     ANGULAR,
     PARAMETERS,
@@ -61,6 +62,7 @@ from rs_localizer.estimation.motion_window import (
 )
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.integrity import Integrity
+from rs_localizer.lens_watch import LensWatch
 from rs_localizer.localizer import Localizer
 from rs_localizer.prediction_errors import PredictionErrors
 from rs_localizer.repeated_images import RepeatedImages, coasting
@@ -169,6 +171,7 @@ class Tracker:
         self._seen: deque[_Seen] = deque(maxlen=LENGTH)  # the newest last
         self._images = RepeatedImages()
         self.shutter = self._watch()
+        self.lens = LensWatch(localizer.config.calibration.distortion)
         self.repeats = False  # whether the last frame shows an image that had come before
         self._track: _Track | None = None
         self._given: tuple[int, Prior] | None = None
@@ -181,6 +184,7 @@ class Tracker:
             from rs_localizer.inertial.gyro_prior import GyroscopeTrack
 
             self._aid = GyroscopeTrack(inertial, localizer.camera.readout_time)
+        self._like_squeeze = _like_squeeze(localizer)
 
     def reset(self) -> None:
         """Forget all frames so far."""
@@ -190,6 +194,7 @@ class Tracker:
         self._seen.clear()
         self._images, self.repeats = RepeatedImages(), False
         self.shutter.reset()
+        self.lens.reset()
         if self._aid is not None:
             self._aid.reset()
 
@@ -198,7 +203,8 @@ class Tracker:
         config, cameras = self.localizer.config, list(self.localizer.rig.cameras.values())
         timed = len(cameras) == 1 and cameras[0].readout_time > 0.0
         watched = timed and find_solver(config.solver).rolling_shutter
-        return ShutterWatch(cameras[0] if watched else None, config.inlier_threshold)
+        aspect_ratio = config.calibration.aspect_ratio
+        return ShutterWatch(cameras[0] if watched else None, config.inlier_threshold, aspect_ratio)
 
     @property
     def inertial(self) -> InertialStatus | None:
@@ -367,6 +373,8 @@ class Tracker:
         """Return the estimate, or the reason why it is not published."""
         if found and self.shutter.refusal:
             return Failure(Reason.SCAN_AXIS, self.shutter.refusal)
+        if found and self.lens.refusal:
+            return Failure(Reason.CALIBRATION, self.lens.refusal)
         return self.localizer.accepted(found)
 
     def localize(
@@ -422,6 +430,7 @@ class Tracker:
         result, prior = self._fitted(time_ns, foreseen, span, context, find)
         if pixels is not None:  # of a camera alone
             self.shutter.add(time_ns, result, np.asarray(points, float), np.asarray(pixels, float))
+            self.lens.add(result)
         if result:
             result = self.shutter.widened(self._judged(result, points, pixels, prior))
             if self.remembers_motion:
@@ -624,9 +633,10 @@ class Tracker:
     ) -> MotionWindow:  # fmt: skip
         """Return a window of the last frames and this one; if it denies them, of this one alone."""
         share = self.readout_time_deviation(context) / result.span
-        alone = MotionWindow.begin(
-            gaussian_of(result, time_ns), self.localizer.config.acceleration, share
-        )
+        start, shared = gaussian_of(result, time_ns), self.shutter.squeeze * self._like_squeeze
+        rate = shared / result.span
+        start = start._replace(covariance=start.covariance + np.outer(rate, rate))
+        alone = MotionWindow.begin(start, self.localizer.config.acceleration, share)
         if track is None:
             return alone
         window = track.window
@@ -636,7 +646,7 @@ class Tracker:
         near = prior if result.tracked else None
         try:
             known = self.localizer.known_of(near, result.span, result.turn)
-            sample = sample_of(result, time_ns, known)
+            sample = sample_of(result, time_ns, known, shared)
             window = replace(window, readout_share=share).joined(sample)
         except np.linalg.LinAlgError:  # rounding errors are all that is left of a covariance
             return alone
@@ -672,3 +682,16 @@ def _check_motion(localizer: Localizer) -> None:
         raise ValueError(
             f"tracking needs velocities, which solver {localizer.config.solver} does not find"
         )
+
+
+def _like_squeeze(localizer: Localizer) -> Array:
+    """Step (18,), rad per readout, that an image looks like whose rows are twice as far apart.
+
+    Cameras of a rig that look elsewhere tell it from a turn: of several it is zero.
+    """
+    turn, cameras = np.zeros(PARAMETERS), list(localizer.rig.cameras.values())
+    if len(cameras) == 1:
+        along = int(cameras[0].scan_direction in ROW_BY_ROW)
+        extent = cameras[0].size[along] / cameras[0].focal_length
+        turn[ANGULAR.start + 1 - along] = extent
+    return turn

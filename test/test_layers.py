@@ -20,7 +20,7 @@ TRACED = ("core/simd/tracing.py", "core/simd/vector_type.py")
 # What each part may import besides itself; every part has a row.
 METHOD = {
     *("core", "config", "solvers", "estimation", "inertial", "integrity", "localizer"),
-    *("prediction_errors", "repeated_images", "shutter_watch", "tracking"),
+    *("lens_watch", "prediction_errors", "repeated_images", "shutter_watch", "tracking"),
 }
 MAY_IMPORT: dict[str, set[str]] = {
     "process": set(),
@@ -35,6 +35,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "integrity": {"core", "estimation"},
     "prediction_errors": {"core", "estimation"},
     "repeated_images": {"core", "estimation"},
+    "lens_watch": {"core"},
     "shutter_watch": {"core", "estimation"},
     "tracking": METHOD - {"tracking"},
     "io": {"core"},

@@ -89,7 +89,7 @@ def camera(lens):
 @pytest.mark.parametrize("lens", LENSES)
 def test_points_beyond_90_degrees_are_as_good_as_others(lens):
     rng = np.random.default_rng(7)
-    exact = rsl.LocalizerConfig(calibration=CalibrationErrors(0.0, 0.0, 0.0))
+    exact = rsl.LocalizerConfig(calibration=CalibrationErrors(0.0, 0.0, 0.0, 0.0))
     localizer, squares, used = rsl.Localizer(camera(lens), exact), [], []
     for _ in range(15):
         points, pixels, motion, angle = frame(rng, lens, 150, 0.5)

@@ -23,6 +23,7 @@ from rs_localizer.core.lens_laws import LensLaw
 # No model has fewer coefficients; k1, k2 stand first in all, and p1, p2 behind them.
 _FEWEST = 4
 _OF_MATRIX = 4  # focal lengths and centre
+_MOST_DECENTRED = 0.2  # of width and height
 # What is the same for all frames of a camera; of the cameras of a rig, and lenses that are tried.
 _remembered = lru_cache(64)
 
@@ -39,6 +40,24 @@ def corner_of(camera: Camera) -> float:
     across = np.array([roi.x_offset, roi.x_offset + roi.width]) - K[0, 2]
     down = np.array([roi.y_offset, roi.y_offset + roi.height]) - K[1, 2]
     return float(np.hypot(np.abs(across).max() / K[0, 0], np.abs(down).max() / K[1, 1]))
+
+
+def centre_of(camera: Camera) -> Array:
+    """The principal point (2,), in delivered pixels."""
+    roi = camera.roi
+    origin = (0.0, 0.0) if roi is None else (roi.x_offset, roi.y_offset)
+    centre: Array = (camera.K[:2, 2] - origin) / camera.binning
+    return centre
+
+
+@_remembered
+def off_centre(camera: Camera) -> bool:
+    """Whether the principal point is where no lens has it, but a K of another image has.
+
+    Lenses are decentred by some 5 % of the image; regions of interest have theirs anywhere.
+    """
+    away = centre_of(camera) / camera.size - 0.5
+    return camera.roi is None and bool(np.any(np.abs(away) > _MOST_DECENTRED))
 
 
 @_remembered

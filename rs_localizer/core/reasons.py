@@ -18,6 +18,7 @@ class Reason(StrEnum):
     RESIDUAL = "residual"
     DEGENERATE = "degenerate"
     MODEL_ERROR = "model_error"
+    CALIBRATION = "calibration"
     UNCERTAIN = "uncertain"
     SCAN_AXIS = "scan_axis"
     AWAITS_FRAMES = "awaits_frames"

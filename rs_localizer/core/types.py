@@ -58,6 +58,7 @@ class Estimate(Motion):
     # (k,3) rad: what the camera turns beside the motion (rs_localizer.core.shake): vibration
     shake: Array = field(default_factory=np.zeros((0, 3)).copy)
     model_error: float = 0.0  # px, rms of what map, lens and motion leave beside the noise
+    declared_error: float = 0.0  # px, what map and calibration are declared to leave of it
     tracked: bool = False  # found near a prior motion, without a search
     time_ns: int = 0  # of a tracker: when the middle row was exposed
     # How a gyroscope says that the camera turned; velocities and accelerations are those of both

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Effect of errors of calibration and map, the same in all frames, on a pose.
 
-Centre, focal length and distortion of an ordinary calibration have errors; so has a map that is
+Centre, focal lengths and distortion of an ordinary calibration have errors; so has a map that is
 bent, or whatever else a smooth error was fitted for; and landmarks that were found together are off
 together, as the map may tell (:class:`ErrorModes`). No tracker averages them away: they join what
 is published of a frame, and not what goes on to the next. To first order a calibration that moves
@@ -13,6 +13,7 @@ error of ``f`` deviations moves them by ``-noise^2 H^-1 f``.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -30,15 +31,16 @@ from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.prior import SPEEDS, PriorTerms, add_prior, terms_at
 from rs_localizer.estimation.refine import inverted
 from rs_localizer.estimation.residuals import linearized
-from rs_localizer.estimation.smooth_error import smooth_columns
+from rs_localizer.estimation.smooth_error import ORDINARY, smooth_columns
 from rs_localizer.native import entry
 
-# Of each camera: centre (2), focal length, distortion.
-_ERRORS = 4
+# Of each camera: centre (2), focal length, distortion, fy over fx.
+_ERRORS = 5
 # Of a combination of typical speeds, the part of one that does not count.
 _NO_PART = 0.02
 _CONFIGURED = np.array([speed == 1.0 for speed in SPEEDS], float)
-
+# fy over fx changes as each changes by a half, the other way.
+_ASPECT = np.array([-0.5, 0.5])
 
 # Points this near (m) to a landmark are that landmark, in single precision as far as 8 km.
 _SAME = 0.001
@@ -140,6 +142,21 @@ def calibration_effect(
     return effect
 
 
+def promised(posterior: Posterior) -> float:
+    """Smooth errors (px, root mean square) that map and calibration are declared to leave."""
+    return math.hypot(posterior.declared, ORDINARY)
+
+
+def widened(effect: CalibrationEffect, posterior: Posterior) -> CalibrationEffect:
+    """The effect of a calibration and a map whose errors are larger than they are declared.
+
+    To a factor of e their size is not known (:mod:`.smooth_error`). What lies beyond is an error
+    of the deviations, all of them alike (Birge's ratio): residuals do not tell which.
+    """
+    ratio = posterior.model_error / (math.e * promised(posterior))
+    return effect._replace(covariance=max(ratio, 1.0) ** 2 * effect.covariance)
+
+
 @entry
 def _lines(
     data: Array2, tau: Array1, state: Array1, shake: Array2, chosen: BoolArray1
@@ -205,7 +222,7 @@ def _effect(
 
 
 def _columns(camera: Camera, towards: Array, deviation: CalibrationErrors) -> Array:
-    """Shifts (n,2,4) in px of rays or bearings by a standard deviation of each error."""
+    """Shifts (n,2,5) in px of rays or bearings by a standard deviation of each error."""
     corner = corner_of(camera)
     corner_pixels = corner * camera.focal_length / camera.binning[0]
     columns = np.zeros((len(towards), 2, _ERRORS))
@@ -215,9 +232,12 @@ def _columns(camera: Camera, towards: Array, deviation: CalibrationErrors) -> Ar
         pixels, slopes = radial_slopes(towards, lens[0], lens[2])
         columns[:, :, 2] = deviation.focal_length * pixels
         columns[:, :, 3] = deviation.distortion / (corner_pixels * corner**2) * slopes
+        columns[:, :, 4] = deviation.aspect_ratio * pixels * _ASPECT
         return columns
     by_all = by_lens(camera, towards)
     focal = coefficients_of(camera) - 4
     columns[:, :, 2] = deviation.focal_length * by_all[:, :, focal : focal + 2].sum(axis=2)
     columns[:, :, 3] = deviation.distortion / corner_pixels * by_all[:, :, 0]
+    by_each = np.diagonal(by_all[:, :, focal : focal + 2], axis1=1, axis2=2)
+    columns[:, :, 4] = deviation.aspect_ratio * by_each * _ASPECT
     return columns

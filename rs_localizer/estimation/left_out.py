@@ -17,10 +17,12 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, Array2, BoolArray
+from rs_localizer.core.lens import centre_of, off_centre
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.state import MOVE, PARAMETERS, TURN, step_between
 from rs_localizer.core.types import Failure
 from rs_localizer.estimation.acceptance import speeding
+from rs_localizer.estimation.calibration import promised
 from rs_localizer.estimation.observations import Observations, Observed
 from rs_localizer.estimation.posterior import WIDEST_GATE, Posterior, best_motion
 from rs_localizer.estimation.prior import add_prior
@@ -55,11 +57,17 @@ _LENGTHS = (1.0, 0.7, 0.5, 1.4, 2.0)
 # Focal length and principal point, in focal lengths: K's, and what those of another image (binned,
 # a region of it) deviate by.
 _OF_K, _DEVIATIONS = np.array([1.0, 0.0, 0.0]), np.array([1.0, 0.3, 0.3])
+# The same of an image of another size, about one of the lengths: the principal point moves along.
+_OF_SIZE = np.array([0.3, 0.03, 0.03])
 _LENS = len(_OF_K)
 # Gain in the logarithm of the evidence for each point, from which another matrix is believed: all
 # points are seen through it. Wrong ones gain 1.5 and more (72 frames); before a curled sheet, whose
 # errors many points share, another matrix gains 0.6.
 _EACH = 1.0
+# Smooth errors, in parts of what is declared, from which another matrix is looked for where no
+# points are left out: boards of paper have up to 10 (12 videos), a K of another size before one
+# wall 8 to 36.
+_BENT, _BENT_OFF_CENTRE = 10.0, 1.0
 # Deviation of a K of this very image, which errors that are smooth over it stand for. Both are as
 # probable where K is off by 0.048: the principal point of a phone is by 0.012, and of a lens of
 # which a third is missing by 0.03 (paired set).
@@ -91,6 +99,13 @@ class _Lens(NamedTuple):
     numbers: Array  # (3,) see _through
 
 
+class _Known(NamedTuple):
+    """A Gaussian of another matrix."""
+
+    mean: Array  # (3,) see _through
+    whitened: Array  # (3,3) of which the square is its information
+
+
 def left_out(
     search: MotionSearch, observed: Observed, posterior: Posterior, threshold: float, known: bool
 ) -> LeftOut:
@@ -108,8 +123,14 @@ def left_out(
     found, left = int(np.count_nonzero(inliers)), int(np.count_nonzero(rest))
     wide = posterior.gate > _WIDE * threshold  # for noise, or for what another matrix explains
     failure = None if known else _by_chance(observed, posterior, wide)
-    if failure is not None or not (wide or np.count_nonzero(~inliers) >= _SAMPLE):
+    if failure is not None:
         return LeftOut(failure, _rough(observed, posterior) if wide else "")
+    if not (wide or np.count_nonzero(~inliers) >= _SAMPLE):
+        most = _BENT_OFF_CENTRE if _is_off_centre(observed) else _BENT
+        bent = posterior.model_error > most * promised(posterior)
+        if known or not bent or not observed.sighted.exposure.alone:
+            return LeftOut()
+        return LeftOut(_of_another_lens(search, observed, posterior, None, threshold))
     strewn = not wide and _moved_alike(observed, posterior, ~inliers) < _STREWN
     second = None
     if left > _SAMPLE and (not strewn or _odds(found, left, posterior.speeding) < least):
@@ -138,6 +159,11 @@ def left_out(
         f"{text}: which of both is the camera's? A part of the map was moved, or the calibration "
         "is grossly wrong",
     ))  # fmt: skip
+
+
+def _is_off_centre(observed: Observed) -> bool:
+    """Whether K's principal point alone speaks for another image."""
+    return off_centre(observed.sighted.exposure.cameras[0])
 
 
 def _rough(observed: Observed, posterior: Posterior) -> str:
@@ -200,14 +226,16 @@ def _of_another_lens(
     first = _Group(posterior.inliers, posterior.state, posterior.squared_errors)
     parts = [(first,)] if second is None else [(first,), (first, second)]
     evidence = max(_evidence(groups, PARAMETERS * len(groups), count, area) for groups in parts)
-    least = evidence + max(_EACH * count, _LEAST_CHANCE)
+    each = 0.0 if _is_off_centre(observed) else _EACH
+    least = evidence + max(each * count, _LEAST_CHANCE)
     if _evidence((lens.group,), PARAMETERS + _LENS, count, area) < least:
         return None
     more = np.count_nonzero(lens.group.chosen) - np.count_nonzero(first.chosen)
     length, *shift = lens.numbers * (1.0, *[observed.assumed.focal_length] * 2)
+    beside = f"and {more} more" if more > 0 else "and better"
     return Failure(
-        Reason.MODEL_ERROR,
-        f"{np.count_nonzero(first.chosen)} points fit, and {more} more with a focal length of "
+        Reason.CALIBRATION,
+        f"{np.count_nonzero(first.chosen)} points fit, {beside} with a focal length of "
         f"{length:.2f} times K's and a principal point {shift[0]:+.0f}, {shift[1]:+.0f} px "
         "from K's: is K, its binning or its region of interest that of another image?",
     )
@@ -229,28 +257,51 @@ def _evidence(groups: tuple[_Group, ...], parameters: int, count: int, area: flo
 
 def _another_lens(search: MotionSearch, observed: Observed, threshold: float) -> _Lens | None:
     """The motion of most points before a camera with another focal length and principal point."""
+    area, count = _area(observed), observed.observations.count
+    kinds = (False, True) if _is_off_centre(observed) else (False,)
+    found = [_lens_of(search, observed, threshold, of_size) for of_size in kinds]
+    return max(
+        (lens for lens in found if lens is not None),
+        key=lambda lens: _evidence((lens.group,), PARAMETERS + _LENS, count, area),
+        default=None,
+    )
+
+
+def _lens_of(
+    search: MotionSearch, observed: Observed, threshold: float, of_size: bool
+) -> _Lens | None:
+    """The same, of any image, or of one of another size whose K this is: then the principal point
+    goes with the focal length, and both show before a wall, where neither does alone.
+    """
     focal, last = observed.assumed.focal_length, WIDEST_GATE * threshold
-    middle = 0.5 * np.array(observed.sighted.exposure.cameras[0].size) / focal
-    most, gate, state, lens = _SAMPLE + _LENS, 0.0, np.zeros(0), np.zeros(_LENS)
-    for length, scaled in product(_LENGTHS, (False, True)):
+    camera, most = observed.sighted.exposure.cameras[0], _SAMPLE + _LENS
+    middle = centre_of(camera) / focal if of_size else 0.5 * np.array(camera.size) / focal
+    gate, state, lens, least = 0.0, np.zeros(0), np.zeros(_LENS), math.inf
+    enough = observed.observations.count - _SAMPLE
+    for length, scaled in product(_LENGTHS, (True,) if of_size else (False, True)):
         tried = np.append(length, scaled * (length - 1.0) * middle)
-        start = search.rough(_through(observed, tried))
+        through = _through(observed, tried)
+        start = search.rough(through)
         if start.found:
-            near = _through(observed, tried).observations.within(
-                start.state, length * GLOBAL_SHUTTER_SCALE * focal
-            )
-            if np.count_nonzero(near) > most:
-                most, state, lens = int(np.count_nonzero(near)), start.state, tried
+            errors = through.observations.squared_errors(start.state)
+            near = errors < (length * GLOBAL_SHUTTER_SCALE * focal) ** 2
+            found, off = min(int(np.count_nonzero(near)), enough), float(np.median(errors))
+            if found > most or (of_size and found == most and off < least):
+                most, least, state, lens = found, off, start.state, tried
                 gate = 2.0 * length * GLOBAL_SHUTTER_SCALE * focal
-        if most >= observed.observations.count - _SAMPLE:
+        if most >= enough and not of_size:
             break
     if not len(state):
         return None
+    known = _Known(_OF_K, np.diag(1.0 / _DEVIATIONS))
+    if of_size:
+        known = _Known(lens, np.diag(1.0 / (_OF_SIZE * [lens[0], 1.0, 1.0])))
+        known.whitened[1:, 0] = -middle * np.diag(known.whitened)[1:]
     left = _LAST_STEPS
     while left:
         gate = max(_NARROWER * gate, last)
         left -= gate == last
-        step = _step(_through(observed, lens), state, lens, gate)
+        step = _step(_through(observed, lens), state, lens, known, gate)
         state, lens = apply_step(state, step[:PARAMETERS]), lens + step[PARAMETERS:]
         if not 0.5 * min(_LENGTHS) < lens[0] < 2.0 * max(_LENGTHS):  # NaN is not, either
             return None
@@ -271,7 +322,7 @@ def _through(observed: Observed, lens: Array) -> Observed:
     ))  # fmt: skip
 
 
-def _step(observed: Observed, state: Array, lens: Array, gate: float) -> Array:
+def _step(observed: Observed, state: Array, lens: Array, known: _Known, gate: float) -> Array:
     """Gauss and Newton's step (21,) of a motion and a lens, by the points within a gate."""
     seen, usable = observed.observations, observed.sighted.usable
     lines = linearized(seen.packed, seen.count, state, np.zeros((seen.count, 6)))
@@ -283,14 +334,13 @@ def _step(observed: Observed, state: Array, lens: Array, gate: float) -> Array:
     columns = np.concatenate([lines.by_motion[near], by_length, by_ray], axis=2)
     columns, errors = columns.reshape(-1, PARAMETERS + _LENS), lines.errors[near].ravel()
     information, slope = columns.T @ columns, columns.T @ errors
-    known, pull = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
-    add_prior(observed.terms, state, (EXPECTED_NOISE * gate) ** 2, known, pull)
-    information[:PARAMETERS, :PARAMETERS] += known
+    of_motion, pull = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    add_prior(observed.terms, state, (EXPECTED_NOISE * gate) ** 2, of_motion, pull)
+    information[:PARAMETERS, :PARAMETERS] += of_motion
     slope[:PARAMETERS] += pull
-    for place, deviation in enumerate(_DEVIATIONS, PARAMETERS):
-        weight = (EXPECTED_NOISE * gate / deviation) ** 2
-        information[place, place] += weight
-        slope[place] += weight * (lens - _OF_K)[place - PARAMETERS]
+    of_lens = (EXPECTED_NOISE * gate) ** 2 * known.whitened.T @ known.whitened
+    information[PARAMETERS:, PARAMETERS:] += of_lens
+    slope[PARAMETERS:] += of_lens @ (lens - known.mean)
     step, positive = solve_positive(information, -slope)
     return step if positive else np.full(PARAMETERS + _LENS, np.nan)
 

@@ -23,7 +23,7 @@ from rs_localizer.core.state import (
     rotation_of,
 )
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation.calibration import CalibrationEffect
+from rs_localizer.estimation.calibration import CalibrationEffect, promised
 from rs_localizer.estimation.gaussian import along_arcs
 from rs_localizer.estimation.observations import Observed
 from rs_localizer.estimation.posterior import Posterior
@@ -109,6 +109,7 @@ def estimate_of(
         undetected_covariance=posterior.undetected + beside[:MOTION_PARAMETERS, :MOTION_PARAMETERS],
         shake=posterior.shake,
         model_error=posterior.model_error,
+        declared_error=promised(posterior),
         iterations=samples,
         turn=turn,
         span=observed.sighted.exposure.span,

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
@@ -40,9 +39,6 @@ if TYPE_CHECKING:
 
 # From this chance on of a wrong pose or map, it is more probable than not.
 DOUBTFUL = 0.5
-# Smooth errors (px, root mean square; median of so many frames) that nobody has who calibrated
-# well: surveyed tags before a calibrated lens have 0.2.
-_MUCH, _FRAMES = 0.3, 30
 
 
 class CameraFrames(FrameLocalizer):
@@ -61,7 +57,6 @@ class CameraFrames(FrameLocalizer):
         self._waiting: dict[int, Correspondences] = {}
         # The newest of them that has a pose, without its rows.
         self._newest: Correspondences | None = None
-        self._smooth_errors: deque[float] = deque(maxlen=_FRAMES)
         self._faults: set[str] = set()  # of the shutter, which have been noticed
 
     @property
@@ -200,7 +195,8 @@ class CameraFrames(FrameLocalizer):
         shutter = self._tracker.shutter
         if shutter.fault and shutter.kind not in self._faults:
             self._faults.add(shutter.kind)
-            self._notice(Notice.READOUT_TIME, shutter.fault)
+            notice = Notice.LENS if shutter.kind == "aspect" else Notice.READOUT_TIME
+            self._notice(notice, shutter.fault)
 
     def _published(self, cloud: Correspondences, result: Estimate | Failure) -> Localized | Refusal:
         """A result of the body at the published moment."""
@@ -213,16 +209,8 @@ class CameraFrames(FrameLocalizer):
             self._notice(Notice.STALE_LANDMARKS, said)
         if result.left_out:
             self._notice(Notice.DOUBTFUL, result.left_out)
-        if not len(result.shake):  # vibration moves points smoothly, too
-            self._smooth_errors.append(result.model_error)
-        if len(self._smooth_errors) == _FRAMES:
-            off = float(np.median(self._smooth_errors))
-            if off > _MUCH:
-                self._notice(
-                    Notice.LENS,
-                    f"residuals vary smoothly over the image ({off:.1f} px rms): recalibrate the "
-                    "lens, or survey the map again; until then poses allow for it",
-                )
+        if self._tracker.lens.fault:
+            self._notice(Notice.LENS, self._tracker.lens.fault)
         moment = published_moment(self._config, self._camera, cloud.stamp_ns)
         return self._mounted_result(cloud, result, moment)
 

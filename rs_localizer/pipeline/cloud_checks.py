@@ -6,6 +6,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import BoolArray
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.lens import centre_of, off_centre
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.clouds import Correspondences
 
@@ -37,6 +38,13 @@ def oddities(cloud: Correspondences, camera: Camera, camera_frame: str) -> dict[
                 f"coordinates of {largest:.0f} m in FLOAT32 are known to {1e3 * step:.0f} mm "
                 "only: send them as FLOAT64, or from an origin nearby"
             )
+    if off_centre(camera):
+        x, y = centre_of(camera)
+        notices[Notice.LENS] = (
+            f"the principal point of camera_info, ({x:.0f}, {y:.0f}), is not near the middle of "
+            f"{camera.size[0]} x {camera.size[1]}: is K that of another resolution, or of a whole "
+            "image of which these are a region (fill in its roi)?"
+        )
     width, height = camera.size
     limit = np.array(camera.size) - 0.5 + _SLACK
     outside = np.any((cloud.pixels < -0.5 - _SLACK) | (cloud.pixels > limit), axis=1)

@@ -85,6 +85,10 @@ REASONS: dict[str, Meaning] = {
         "residuals depend on row or place in the image",
         f"vibration (IMU)? check calibration, map, {SETTINGS}",
     ),
+    Reason.CALIBRATION: Meaning(
+        "points fit a camera with another matrix",
+        "is K, its binning or region of interest that of these images?",
+    ),
     Reason.UNCERTAIN: Meaning(
         "orientation deviation above max_orientation_deviation",
         "come nearer, show more of the map",

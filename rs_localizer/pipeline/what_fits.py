@@ -20,7 +20,7 @@ from rs_localizer.localizer import Localizer
 
 REASONS = frozenset({
     Reason.TOO_FEW_POINTS, Reason.NO_HYPOTHESIS, Reason.TOO_FEW_INLIERS, Reason.BEHIND_CAMERA,
-    Reason.RESIDUAL, Reason.MODEL_ERROR,
+    Reason.RESIDUAL, Reason.MODEL_ERROR, Reason.CALIBRATION,
 })  # fmt: skip
 """Reasons of refusals that such a mistake may have."""
 

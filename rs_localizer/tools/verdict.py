@@ -170,7 +170,8 @@ def of_lens(found: CameraCalibration) -> Iterator[str]:
     errors = found.lens
     yield (
         f"{'what it is off by':26} centre {errors.principal_point:.2g} px, focal length "
-        f"{100.0 * errors.focal_length:.2g} %, distortion {errors.distortion:.2g} px at the corners"
+        f"{100.0 * errors.focal_length:.2g} %, fy over fx {100.0 * errors.aspect_ratio:.2g} %, "
+        f"distortion {errors.distortion:.2g} px at the corners"
     )
 
 

@@ -22,7 +22,7 @@ CAMERA = rsl.Camera(
     640, 480, np.array([[450.0, 0.0, 319.5], [0.0, 450.0, 239.5], [0.0, 0.0, 1.0]]),
     readout_time=0.02,
 )  # fmt: skip
-EXACT = CalibrationErrors(0.0, 0.0, 0.0)
+EXACT = CalibrationErrors(0.0, 0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("coefficients", [0, 5, 8, 12])
@@ -32,7 +32,7 @@ def test_errors_of_a_lens_move_pixels_as_differences_of_opencv_say(coefficients)
     K = np.array([[430.0, 0.0, 310.0], [0.0, 470.0, 250.0], [0.0, 0.0, 1.0]])
     D = rng.uniform(-0.05, 0.05, coefficients)
     rays = rng.uniform([-0.7, -0.5], [0.7, 0.5], (20, 2))
-    deviation, step = CalibrationErrors(0.7, 0.01, 1.3), 1e-5
+    deviation, step = CalibrationErrors(0.7, 0.01, 1.3, 0.02), 1e-5
     model = "rational_polynomial" if coefficients > 5 else "plumb_bob"
     found = _columns(rsl.Camera(640, 480, K, D=D, distortion_model=model), rays, deviation)
 
@@ -52,6 +52,7 @@ def test_errors_of_a_lens_move_pixels_as_differences_of_opencv_say(coefficients)
     np.testing.assert_allclose(found[:, :, 1], 0.7 * np.tile([0.0, 1.0], (20, 1)))
     np.testing.assert_allclose(found[:, :, 2], 0.01 * by_focal, atol=1e-6)
     np.testing.assert_allclose(found[:, :, 3], k1 * by_k1, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(found[:, :, 4], 0.01 * by_focal * [-1.0, 1.0], atol=1e-6)
 
 
 def off(principal_point: float = 0.0, focal_length: float = 0.0) -> rsl.Camera:

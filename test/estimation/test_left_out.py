@@ -13,6 +13,7 @@ import rs_localizer as rsl
 from benchmarks.frames import paired_set
 from benchmarks.frames.judged import far_off, judge
 from benchmarks.gross import frame
+from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.estimation.left_out import as_nearest
 
@@ -60,6 +61,26 @@ def test_another_matrix_is_named(fault, length):
         assert found == pytest.approx(length, rel=0.02)
         assert np.abs(camera.K[:2, 2] + centre - (319.5, 239.5)).max() < 10.0
     assert named >= 2
+
+
+@pytest.mark.parametrize("share", [2.0, 0.5])
+def test_a_k_of_another_size_is_refused_before_one_wall(share):
+    """Where focal length and distance go together; the principal point tells the size."""
+    random, named, published = np.random.default_rng(3), 0, 0
+    for _ in range(12):
+        camera, points, pixels, _ = frame("wall", "right", random)
+        K = camera.K * share
+        K[2, 2] = 1.0
+        assert rsl.Localizer(camera).localize(points, pixels)
+        result = rsl.Localizer(rsl.Camera(640, 480, K, readout_time=0.02)).localize(points, pixels)
+        published += bool(result)
+        found = re.search(r"a focal length of (\S+) times K's", str(result))
+        if found:
+            assert float(found[1]) == pytest.approx(1.0 / share, rel=0.1)
+            assert result.reason == Reason.CALIBRATION
+            named += 1
+    assert named >= 2
+    assert published <= 1  # a camera that looks at the wall straight on
 
 
 def test_a_principal_point_that_is_a_little_off_is_no_other_image():

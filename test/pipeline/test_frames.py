@@ -110,7 +110,7 @@ def test_without_a_readout_time_there_is_a_pose_but_no_twist(make_camera_info, p
 
 
 @pytest.mark.parametrize(("bend", "told"), [(0.0, set()), (4.0, {"lens"})])
-def test_a_lens_that_is_off_is_noticed_after_a_second(make_camera_info, bend, told):
+def test_a_lens_that_is_off_is_noticed_after_half_a_second(make_camera_info, bend, told):
     notices: list[tuple[str, str]] = []
     config = NodeConfig(readout_time=READOUT_TIME)
     frames = CameraFrames(config, lambda *words: notices.append(words))
@@ -122,7 +122,7 @@ def test_a_lens_that_is_off_is_noticed_after_a_second(make_camera_info, bend, to
         stamp_ns = seen.stamp_ns + k * 33_000_000
         noisy = bent + rng.normal(0.0, 0.2, bent.shape)
         localized(frames.localize(cloud_of(stamp_ns, seen.points, noisy)))
-        if k < 29:
+        if k < 14:
             assert notices == []
     assert {name for name, _ in notices} == told
 

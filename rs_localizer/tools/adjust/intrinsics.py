@@ -29,7 +29,8 @@ class LensErrors(NamedTuple):
 
     principal_point: float  # px, of all of the image alike
     focal_length: float  # share
-    distortion: float  # px at the corners, of what is neither
+    distortion: float  # px at the corners, of what is none of the others
+    aspect_ratio: float  # share, of fy over fx
 
     def or_half(self, difference: LensErrors) -> LensErrors:
         """Together with half of what two halves of a recording differ by."""
@@ -129,9 +130,10 @@ def lens_difference(camera: Camera, other: Camera) -> LensErrors:
 
 
 def _field(camera: Camera) -> tuple[Array, Array]:
-    """Rays (n,3) through the image, and how what an error may be taken for moves pixels (2 n, 3).
+    """Rays (n,3) through the image, and how what an error may be taken for moves pixels (2 n, 4).
 
-    The corners come first; three shifts and a scale are what an error of the lens may be taken for.
+    The corners come first; two shifts, a scale and a squeeze are what an error of the lens may be
+    taken for.
     """
     width, height = camera.size
     u, v = np.meshgrid(np.linspace(0.0, width - 1.0, _GRID), np.linspace(0.0, height - 1.0, _GRID))
@@ -139,10 +141,11 @@ def _field(camera: Camera) -> tuple[Array, Array]:
     pixels = np.concatenate([corners, np.column_stack([u.ravel(), v.ravel()])])
     rays = np.column_stack([camera.rays(pixels), np.ones(len(pixels))])
     usable = np.isfinite(rays).all(axis=1)
-    design = np.zeros((len(pixels), 2, 3))
+    design = np.zeros((len(pixels), 2, 4))
     design[:, 0, 0] = design[:, 1, 1] = 1.0
     design[:, :, 2] = pixels - lens_values(camera)[2:4]
-    return rays[usable], design[usable].reshape(-1, 3)
+    design[:, :, 3] = design[:, :, 2] * [-0.5, 0.5]
+    return rays[usable], design[usable].reshape(-1, 4)
 
 
 def _parts(design: Array, moved: Array) -> LensErrors:
@@ -154,6 +157,7 @@ def _parts(design: Array, moved: Array) -> LensErrors:
         float(np.hypot(size[0], size[1]) / np.sqrt(2.0)),
         float(size[2]),
         float(np.sqrt(np.sum(rest**2) / len(rest))),
+        float(size[3]),
     )
 
 

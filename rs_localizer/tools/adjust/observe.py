@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rs_localizer.config import CalibrationErrors
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
@@ -17,8 +18,10 @@ from rs_localizer.localizer import Localizer
 from rs_localizer.tools.adjust.variables import SplineKeypoints
 
 # What a wrong lens looks like in one image, and how much larger errors may be there.
-_OF_THE_LENS = (Reason.MODEL_ERROR, Reason.RESIDUAL)
+_OF_THE_LENS = (Reason.MODEL_ERROR, Reason.RESIDUAL, Reason.CALIBRATION)
 _ROUGH = 5.0
+# Of a lens that is a guess.
+_ANY_LENS = CalibrationErrors(focal_length=0.3, distortion=20.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +59,8 @@ def localize_each(
     start for an estimator that finds the lens as well.
     """
     localizer = Localizer(camera)
-    rough = Localizer(camera, inlier_threshold=_ROUGH * localizer.config.inlier_threshold)
+    gate = _ROUGH * localizer.config.inlier_threshold
+    rough = Localizer(camera, inlier_threshold=gate, calibration=_ANY_LENS)
     results = []
     for image in images:
         result = localizer.find(image.points, image.pixels)

@@ -27,7 +27,9 @@ from rs_localizer.markers.prints import Chessboard
 TRUE = TrueCamera()
 LENGTH = 8
 # The lens is exact.
-CONFIG = NodeConfig(readout_time=TRUE.readout_time, calibration=CalibrationErrors(0.0, 0.0, 0.0))
+CONFIG = NodeConfig(
+    readout_time=TRUE.readout_time, calibration=CalibrationErrors(0.0, 0.0, 0.0, 0.0)
+)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,60 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What frames after frames say of lens and map: named with both numbers, or nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import rs_localizer as rsl
+from benchmarks.gross import frame
+from rs_localizer.config import CalibrationErrors
+from rs_localizer.core.reasons import Reason
+from rs_localizer.core.types import Failure
+from rs_localizer.lens_watch import LensWatch
+from rs_localizer.tracking import Tracker
+
+WELL = CalibrationErrors(0.1, 4e-4, 0.05, 4e-4)
+
+
+def watched(bend: float, calibration: CalibrationErrors) -> LensWatch:
+    """After 20 images of a volume whose corners are bent by so many px."""
+    random = np.random.default_rng(1)
+    camera, points, pixels, _ = frame("volume", "right", random)
+    away = (pixels - camera.K[:2, 2]) / camera.focal_length
+    bent = pixels + bend * (away**2).sum(axis=1)[:, None] * away
+    tracker = Tracker(rsl.Localizer(camera, calibration=calibration), remembers_motion=False)
+    for k in range(20):
+        noisy = bent + random.normal(0.0, 0.05, bent.shape)
+        assert tracker.localize(10**9 + 33_000_000 * k, points, noisy)
+    return tracker.lens
+
+
+@pytest.mark.parametrize("calibration", [WELL, CalibrationErrors()])
+def test_a_lens_that_is_as_declared_is_told_nothing(calibration):
+    assert watched(0.0, calibration).fault == ""
+
+
+def test_a_calibration_is_held_to_what_it_promises():
+    """Of an ordinary one 0.2 px are no wonder, of a good one they are, and both are named."""
+    fault = watched(3.5, WELL).fault
+    assert "px rms), more than the deviations of calibration and map allow (0." in fault
+    assert all(word in fault for word in ("another mode", "rectified", "stabilised"))
+    assert watched(3.5, CalibrationErrors()).fault == ""
+
+
+def test_three_frames_that_another_matrix_explains_refuse_all_until_they_are_old():
+    watch, other = LensWatch(0.5), Failure(Reason.CALIBRATION, "K is that of another image")
+    random = np.random.default_rng(1)
+    camera, points, pixels, _ = frame("volume", "right", random)
+    found = rsl.Localizer(camera).localize(points, pixels)
+    for _ in range(3):
+        assert watch.refusal == ""
+        watch.add(other)
+        watch.add(found)
+        watch.add(replace(other, reason=Reason.UNCERTAIN))
+    assert watch.refusal == other.detail
+    for _ in range(30):
+        watch.add(found)
+    assert watch.refusal == ""
