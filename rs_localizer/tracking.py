@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.config import Acceleration, RefinementKind
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import BoolArray, instance
+from rs_localizer.core.arrays import Array, BoolArray, instance
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import ByCamera, Rig, RigEstimate

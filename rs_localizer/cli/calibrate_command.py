@@ -318,7 +318,8 @@ def _write(
     remarks = [f"readout_time {refused}"] if refused else []
     camera = found.fit.camera
     _write_files(args, values, lens_parameters(camera), {"": camera}, writers, remarks)
-    print(f"next: {_next(args, intrinsics or args.calibration is not None, shape)}")
+    if not found.processed:  # else the lens is that of a picture that was moved
+        print(f"next: {_next(args, intrinsics or args.calibration is not None, shape)}")
     return True
 
 

@@ -197,22 +197,25 @@ class Evidence:
         why = self._why_not()
         return f"not observable: {value}{why}" if why else ""
 
+    @property
+    def processed(self) -> str:
+        """Why the film is hardly what the camera saw, one sentence; '': nothing says so."""
+        why = []
+        if self.stabilised:
+            why.append(f"parts of the recording disagree ({self.parts} ms)")
+        if self.jitter > _BESIDE:
+            why.append(f"exposures are {1e3 * self.jitter:.1f} ms rms off their stamps")
+        return (
+            f"{' and '.join(why)}: is image stabilisation on, or was the video processed? Record "
+            "with the camera's own time stamps, without losing images or re-encoding the video"
+            if why
+            else ""
+        )
+
     def _why_not(self) -> str:
         """Reason against it, as it goes on from the value; or ''."""
-        why = ""
-        if self.jitter > _BESIDE:
-            why += (
-                f"; exposures are {1e3 * self.jitter:.1f} ms rms off their "
-                "stamps: record with the camera's own time stamps, without losing images or "
-                "re-encoding the video"
-            )
-        if self.stabilised:
-            why += (
-                f"; parts of the recording disagree ({self.parts} ms): is "
-                "image stabilisation on, or was the video processed?"
-            )
-        if why:
-            return why
+        if self.processed:
+            return f"; {self.processed}"
         if abs(self.readout_time) > _LONGEST * self.stamps.interval:
             return (
                 f" is longer than the interval between images, "

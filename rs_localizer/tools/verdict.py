@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -28,6 +29,8 @@ _REGIONS = (
 _MOST_TURN, _SIGMAS = 1.0, 4.0
 # Who says how the IMU hangs on the camera.
 _GIVEN = "TF, or the axes of a video,"
+# Corners that are bent by less (px) are those of a rectified film, or of a telephoto lens.
+_STRAIGHT = 1.5
 # A scale of the gyroscope that is worth a word.
 _LEAST_SCALE = 0.005
 
@@ -132,6 +135,8 @@ def uncovered(result: CameraCalibration) -> list[str]:
 
 def table(found: CameraCalibration, rate: float | None) -> Iterator[str]:
     """Rows of what was found, its parts, and remarks; ``rate``: of the images, as it was given."""
+    if found.processed:  # before figures that it makes worthless
+        yield f"warning: {found.processed}"
     for name, text in (
         ("readout time", f"{1e3 * readout_time(found):.3f} ms"),
         ("standard deviation", f"{1e3 * found.deviation:.3f} ms"),
@@ -168,10 +173,27 @@ def of_lens(found: CameraCalibration) -> Iterator[str]:
     for name, value, deviation in zip(names, state.lens, deviations, strict=True):
         yield f"{name:26} {value:.5g} +- {found.inflation * deviation:.2g}"
     errors = found.lens
+    if straightness := _straightness(found):
+        yield straightness
     yield (
         f"{'what it is off by':26} centre {errors.principal_point:.2g} px, focal length "
         f"{100.0 * errors.focal_length:.2g} %, fy over fx {100.0 * errors.aspect_ratio:.2g} %, "
         f"distortion {errors.distortion:.2g} px at the corners"
+    )
+
+
+def _straightness(found: CameraCalibration) -> str:
+    """What a lens without distortion means; '' for all others."""
+    camera = found.fit.camera
+    width, height = np.array(camera.size) - 1.0
+    corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
+    off = camera.rays(corners) - replace(camera, D=np.zeros(0)).rays(corners)
+    bent = camera.focal_length * float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+    if not bent < max(_STRAIGHT, _SIGMAS * found.lens.distortion):  # NaN is not
+        return ""
+    return (
+        f"the lens bends nothing ({bent:.1f} px at the corners): is the film rectified? Its rows "
+        "are no longer those that were exposed together; film without correction of the lens"
     )
 
 

@@ -87,6 +87,7 @@ def test_irregular_stamps_are_noticed_and_do_little_harm():
     agrees(found, 0.02, 1e-3)
     assert found.stamps.irregular
     assert found.jitter == pytest.approx(3e-3, rel=0.3)
+    assert found.processed.startswith("exposures are ")
     assert any("irregular" in remark for remark in verdict.remarks(found))
 
 
@@ -99,6 +100,9 @@ def test_a_picture_that_is_turned_after_the_fact_makes_parts_disagree():
     found = calibrate(CAMERA, images)
     assert found.stabilised
     assert "stabilisation" in verdict.refusal(found)
+    first, *_ = verdict.table(found, None)  # before figures that look like findings
+    assert first.startswith("warning: parts of the recording disagree (")
+    assert "is image stabilisation on" in first
     assert not any("times less likely" in remark for remark in verdict.remarks(found))
 
 
