@@ -104,7 +104,7 @@ def read_frames(path: Path, most: int | None = None) -> list[FrameMessages]:
 
 
 def _simulated(most: int | None, images: bool) -> tuple[list[FrameMessages], float, Motions]:
-    """Frames of a flight through points, or of rendered walls; readout time (s), and the truth."""
+    """Return frames of a flight, or of rendered walls, the readout time (s), and the truth."""
     start, duration = _WALLS if images else _FLIGHT
     args = simulate_command.Options(
         out=Path(), trajectory=Path(simulate_command.BUNDLED), images=images,
@@ -136,7 +136,7 @@ def _simulated(most: int | None, images: bool) -> tuple[list[FrameMessages], flo
 def _localized(
     title: str, frames: Sequence[FrameMessages], readout_time: float, true: Motions | None
 ) -> tuple[dict[str, dict[int, Localized]], dict[str, dict[str, errors.Errors]]]:
-    """The frames by method and stamp, as a node localizes them, and errors; medians are printed."""
+    """Localize the frames by method as a node does, print medians, and return errors, too."""
     answers, rows = dict[str, dict[int, Localized]](), dict[str, dict[str, float]]()
     off = dict[str, dict[str, errors.Errors]]()
     for solver in _METHODS:
@@ -170,7 +170,7 @@ def _settings(solver: str, readout_time: float) -> dict[str, Any]:
 def _live(
     frames: Sequence[FrameMessages], answers: Mapping[int, Localized], readout_time: float
 ) -> None:
-    """The flight once more through a live node, which says the same."""
+    """Localize the flight once more with a live node, and compare."""
     live, late, same = import_ros("live", "a live node"), list[float](), 0
     settings = _settings(_METHODS[0], readout_time)
     with tempfile.NamedTemporaryFile() as log:

@@ -265,7 +265,7 @@ class _Recorder:
             self._map = Map(self.world, ids, marks, MAP_FRAME)
 
     def write(self, folder: Path) -> None:
-        """The bag, and beside it the parameters of the cameras and what they see."""
+        """Write the bag, and beside it the parameters of the cameras and what they see."""
         parameters = self._write_camera(folder) if self._parts is None else self._write_rig(folder)
         if self.counts and not any(self.counts):
             raise ValueError(

@@ -121,7 +121,7 @@ def _readable(
     shots: Iterable[Shot | Carried], bag: BagWriter, found: Extraction, options: DetectionOptions,
     done: Callable[[], object],
 ) -> Iterator[tuple[Shot, Image, Camera]]:  # fmt: skip
-    """The images that can be used, with their cameras, counted; what else is to be kept is written.
+    """Yield usable images with their cameras, and write what else is to be kept.
 
     Raises:
         DetectError: when they and their calibration differ in size.
@@ -174,7 +174,7 @@ class _MarkerTally:
                 self._mistake = self._mistakes.explain_frame(lambda: of_refused(localizer, *frame))
 
     def _localizer(self, camera: Camera) -> Localizer:
-        """The localizer of a camera; of the same one as the last time, the same."""
+        """Return the localizer of a camera; of the same one as the last time, the same."""
         if self._last is None or self._last[0] is not camera:
             self._last = camera, Localizer(camera, min_inliers=_LEAST_INLIERS)
         return self._last[1]
@@ -185,7 +185,7 @@ class _MarkerTally:
         return len(self._found.counts) < _FEW * self._found.images
 
     def nothing(self) -> str:
-        """Sentence on images that show nothing of the map."""
+        """Describe images that show nothing of the map."""
         families = sorted({marker.family.name for marker in self._map.markers})
         wanted = ", ".join([*families, *(board.name for board in self._map.boards)])
         text = f"shows anything of the map ({wanted})"
@@ -268,7 +268,7 @@ class Cameras:
 def seen_by(
     shots: Iterable[Shot | Carried], scan_direction: str, refused: dict[str, str]
 ) -> Iterator[tuple[Image, Camera | None]]:
-    """The images that can be used, each with its camera, without a readout time, if it is known.
+    """Yield the usable images, each with its camera, without a readout time, if it is known.
 
     Args:
         refused: receives the first detail of each reason of those that cannot be used.
@@ -301,7 +301,7 @@ def seen_by(
 
 
 def _why(size: tuple[int, int], calibrated: tuple[int, int]) -> str:
-    """Relation of two sizes of images, in words."""
+    """Describe the relation of two sizes of images."""
     if size == calibrated[::-1]:
         return (
             ": they are rotated by a quarter turn; calibrate with images as they are recorded (the "
@@ -322,7 +322,7 @@ def _write(bag: BagWriter, shot: Shot, topic: str, message: Any, options: Detect
 
 
 def static_residual(camera: Camera, detected: Detected) -> float:
-    """Reprojection error (px rms) of the best global-shutter pose; NaN: there is none."""
+    """Return the error (px rms) of the best global-shutter pose; NaN if there is none."""
     detections = detected.detections
     if len(detections.ids) < _LEAST_CORNERS:
         return np.nan

@@ -65,7 +65,7 @@ Outcome = Figures | str
 
 @functools.cache
 def program() -> str:
-    """Digest of the sources of this package, its version among them."""
+    """Return the digest of the sources of this package, its version among them."""
     files = sorted(Path(__file__).parents[1].rglob("*.py"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
 
@@ -74,7 +74,7 @@ def tasks_of(
     recordings: Sequence[Path], out: Path, work: Callable[[Path, Path], Figures], settings: str,
     inputs: Sequence[Path] = (),
 ) -> list[Task]:  # fmt: skip
-    """A task for each recording, with a folder of its own below ``out``.
+    """Return a task for each recording, with a folder of its own below ``out``.
 
     Args:
         recordings: what is localized; one that stands twice is done once.
@@ -98,14 +98,14 @@ def tasks_of(
 
 
 def _fingerprint(place: Path) -> list[tuple[str, int, int]]:
-    """Name, size and time of change (ns) of each file: reading all of a recording takes long."""
+    """Return name, size and time of change (ns) of each file, instead of reading all of it."""
     files = sorted(place.rglob("*")) if place.is_dir() else [place]
     about = [(file, file.stat()) for file in files if file.is_file()]
     return [(str(file), stat.st_size, stat.st_mtime_ns) for file, stat in about]
 
 
 def finished(task: Task) -> Figures | None:
-    """The figures of a complete result of just this task; None: there is none."""
+    """Return the figures of a complete result of just this task; None if there is none."""
     try:
         about = json.loads((task.folder / MARKER).read_text(encoding="utf-8"))
         return dict(about["figures"]) if about["identity"] == task.identity else None
@@ -114,7 +114,7 @@ def finished(task: Task) -> Figures | None:
 
 
 def perform(task: Task) -> Outcome:
-    """Do a task, unless it has been done: its folder is there afterwards, whole, or not at all.
+    """Do a task, unless it has been done; its folder is there afterwards, whole, or not at all.
 
     Whatever goes wrong with the recording is an outcome, not an exception.
     """
@@ -150,7 +150,7 @@ def perform(task: Task) -> Outcome:
 def perform_all(
     tasks: Sequence[Task], scheduler: str | None, workers: int | None
 ) -> Generator[tuple[Task, Outcome]]:
-    """The outcome of each task, as they come; close the iterator to stop all.
+    """Yield the outcome of each task, as they come; closing the iterator stops all.
 
     Args:
         tasks: what is not done yet.
@@ -218,7 +218,7 @@ def do_all(
     tasks: Sequence[Task], out: Path, scheduler: str | None, workers: int | None,
     heard: Callable[[Task, Outcome], object],
 ) -> dict[Path, Outcome]:  # fmt: skip
-    """Outcome of each, by its folder; the summary in ``out`` is written however it ends.
+    """Return the outcomes by folder; the summary in ``out`` is written however it ends.
 
     Args:
         heard: called as tasks end that had not been done before.

@@ -57,7 +57,7 @@ _ROWS = 1000  # that are Python's objects before they become Arrow's
 
 
 def schema() -> Schema:
-    """Columns of all tables.
+    """Return the columns of all tables.
 
     Raises:
         ImportError: without pyarrow.
@@ -105,7 +105,7 @@ class FrameTable:
             self._flush()
 
     def _at_rows(self, frame: Localized) -> dict[str, Any]:
-        """The camera, and its pose at the first, the middle and the last row of the image."""
+        """Return the camera, and its pose at the first, the middle and the last row."""
         config, calibration = self._localizer.config, self._localizer.calibration
         assert calibration is not None  # without one there is no frame
         camera = calibration.camera(config.readout_time, config.scan_direction)
@@ -130,7 +130,7 @@ class FrameTable:
         self._rows = []
 
     def table(self) -> Table:
-        """All rows in the order of their stamps."""
+        """Return all rows in the order of their stamps."""
         import pyarrow as pa
 
         self._flush()
@@ -138,14 +138,14 @@ class FrameTable:
 
 
 def exposed_rows(camera: Camera) -> tuple[float, float]:
-    """Row times of the first and of the last exposed row of the delivered image."""
+    """Return the row times of the first and last exposed row of the delivered image."""
     width, height = camera.size
     times = camera.row_time(np.array([[0.0, 0.0], [width - 1.0, height - 1.0]]))
     return float(times.min()), float(times.max())
 
 
 def _as_json(camera: Camera, exposed: list[float]) -> str:
-    """Lens and shutter of the delivered image; the centre of its first pixel is at 0, 0."""
+    """Describe lens and shutter of the delivered image; its first pixel centre is at 0, 0."""
     (fx, fy), (cx, cy) = (values.tolist() for values in pixel_intrinsics(camera))
     width, height = camera.size
     return json.dumps({
@@ -208,7 +208,7 @@ def write_parquet(tables: Iterable[Table], place: Path) -> int:
 
 
 def read_parquet(file: Path) -> Table:
-    """Table that :func:`write_parquet` wrote."""
+    """Read a table that :func:`write_parquet` wrote."""
     import pyarrow.parquet as pq
 
     return pq.read_table(file)

@@ -66,7 +66,7 @@ class Carried:
 
 
 def from_video(path: Path, camera: Camera | None, clock: ImageClock) -> Iterator[Shot]:
-    """The images of a video.
+    """Yield the images of a video.
 
     Raises:
         ValueError: when it cannot be read, or has no times and the clock no rate.
@@ -86,7 +86,7 @@ def from_video(path: Path, camera: Camera | None, clock: ImageClock) -> Iterator
 def with_telemetry(
     shots: Iterable[Shot | Carried], telemetry: Telemetry, clock: ImageClock
 ) -> Iterator[Shot | Carried]:
-    """The images of a video, and its gyroscope as ``imu``, in the camera's axes and clock."""
+    """Yield the images of a video, and its gyroscope as ``imu`` in camera axes and time."""
     times_ns = np.round(1e9 * telemetry.times).astype(np.int64)
     sent = 0
     for shot in shots:
@@ -104,7 +104,7 @@ def with_telemetry(
 
 
 def from_files(files: list[Path], camera: Camera | None, clock: ImageClock) -> Iterator[Shot]:
-    """Images of files; their names are times in ns, or they follow each other at a rate."""
+    """Yield images of files; their names are times in ns, or they follow at a rate."""
     times = name_times(files)
     for file in files:
         own = None if times is None else times[file]
@@ -117,7 +117,7 @@ def from_files(files: list[Path], camera: Camera | None, clock: ImageClock) -> I
 
 
 def _read_file(file: Path, stamp: int) -> tuple[Image | Refusal, Any]:
-    """The image of a file, and the same as sensor_msgs/CompressedImage; None: there is none."""
+    """Read the image of a file, and return it as sensor_msgs/CompressedImage, too; or None."""
     packed = read_or_refuse(packed_image, file, Reason.BAD_IMAGE)
     if isinstance(packed, Refusal):
         return packed, None
@@ -126,7 +126,7 @@ def _read_file(file: Path, stamp: int) -> tuple[Image | Refusal, Any]:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """The image files of a folder by name, or by number if the names are numbers.
+    """Return the image files of a folder by name, or by number if the names are numbers.
 
     Raises:
         SourceError: when there is none.
@@ -150,7 +150,7 @@ def image_files(folder: Path) -> list[Path]:
 
 
 def holds_images(path: Path) -> str:
-    """Images of a path that is no recording, as ``is a video``; empty: none."""
+    """Describe the images of a path that is no recording, as ``is a video``; empty: none."""
     if path.is_dir():
         count = sum(file.suffix.lower() in (*SUFFIXES, *FOREIGN) for file in path.iterdir())
         return f"is a folder of {count} images" if count else ""
@@ -160,13 +160,13 @@ def holds_images(path: Path) -> str:
 
 
 def image_topics(bag: BagReader) -> list[str]:
-    """Topics of a bag with images, or with packets of a video."""
+    """Return the topics of a bag with images, or with packets of a video."""
     kinds = (*IMAGE_TYPES, *PACKET_TYPES)
     return sorted(topic for topic, kind in bag.topics.items() if kind in kinds)
 
 
 def find_images(bag: BagReader, given: str | None) -> str:
-    """The topic of images, given or the only one; that of a video in packets if there is no other.
+    """Return the topic of images, given or the only one, else of a video in packets.
 
     Raises:
         SourceError: when it is not there, several could be meant, or PyAV is missing.
@@ -194,7 +194,7 @@ def _since_1970(file: Path) -> int | None:
 
 
 def name_times(files: Sequence[Path]) -> dict[Path, int] | None:
-    """The times, ns, that the names of image files are, each of one image; None: they are none.
+    """Return the times (ns) that the names of image files are, one each; None: they are none.
 
     Nanoseconds since a device was started have up to 16 digits, as microseconds since 1970 have:
     the interval of the images tells them apart.
@@ -209,7 +209,7 @@ def name_times(files: Sequence[Path]) -> dict[Path, int] | None:
 
 
 def find_topic(bag: BagReader, types: tuple[str, ...], given: str | None, option: str) -> str:
-    """The topic of one of these types, given or the only one.
+    """Return the topic of one of these types, given or the only one.
 
     Raises:
         SourceError: when it is not there, or several could be meant.
@@ -234,7 +234,7 @@ def find_topic(bag: BagReader, types: tuple[str, ...], given: str | None, option
 def from_bag(
     bag: BagReader, image_topic: str, info_topic: str | None, camera: Camera | None
 ) -> Iterator[Shot | Carried]:
-    """The images of a bag, each with the latest CameraInfo (before the first one: the first).
+    """Yield the images of a bag, each with the latest CameraInfo (before the first: the first).
 
     Between them comes what replay needs besides: transforms and inertial measurements.
     """
@@ -269,7 +269,7 @@ def from_bag(
 
 
 def _of_packet(packet: Packet, found: VideoImage | str, camera: Camera | None) -> Shot:
-    """The image of a packet, which came beside camera_info and time of recording, or its loss."""
+    """Return the image of a packet that came beside camera_info, or its loss."""
     info, recorded_ns = packet.beside
     if camera is not None:
         info = make_camera_info(camera, packet.stamp_ns, packet.frame or CAMERA_FRAME)

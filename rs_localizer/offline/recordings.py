@@ -44,7 +44,7 @@ class Recorded:
 def read_recording(
     bag: BagReader, topics: Topics, settings: Matching, landmarks: Map | None = None
 ) -> Recorded:
-    """The correspondences of a recording, keypoints matched with its map or a given one.
+    """Read the correspondences of a recording; keypoints are matched with its or a given map.
 
     The camera is that of the last usable camera_info.
 
@@ -86,7 +86,7 @@ def read_recording(
 
 
 def read_imu_recording(bag: BagReader, topic: str | None, camera_frame: str) -> ImuRecording:
-    """Readings of an IMU, and how TF says that it hangs on the camera, if it does.
+    """Read the readings of an IMU, and its mount on the camera if TF has it.
 
     Args:
         topic: None: the only one of its type.
@@ -120,7 +120,7 @@ def read_imu_recording(bag: BagReader, topic: str | None, camera_frame: str) -> 
 
 
 def optical_frame(bag: BagReader, info: str | None = None, image: str | None = None) -> str:
-    """Frame of the camera, by its first camera_info, else its first image; empty: not known.
+    """Return the camera's frame, by its first camera_info or image; empty if unknown.
 
     Args:
         info, image: topics; None: the only one of its type.
@@ -138,7 +138,7 @@ def optical_frame(bag: BagReader, info: str | None = None, image: str | None = N
 def camera_topics(
     bag: BagReader, cameras: Sequence[str] | None = None
 ) -> dict[str, dict[str, str]]:
-    """The topics of each camera of a rig by the names of their inputs.
+    """Return the topics of each camera of a rig by the names of their inputs.
 
     Args:
         cameras: their names, which stand before those of the topics; None: all that there are.
@@ -165,7 +165,7 @@ def camera_topics(
 
 
 def transform_between(bag: BagReader, camera: str, imu: str) -> Transform | None:
-    """``camera_from_imu``, or of any two frames, by TF; None where it does not connect them."""
+    """Return ``camera_from_imu``, or of any two frames, by TF; None if not connected."""
     tree = TransformTree()
     for topic in tf_topics(bag, TF_TYPE):
         for _, _, message in bag.messages((topic,)):

@@ -70,7 +70,7 @@ class Track:
         self._maps.add(repr(frame.map_frame))
 
     def motions(self) -> Motions:
-        """In the order of their stamps, the first of each; twists where there are any."""
+        """Return the motions in the order of their stamps, the first of each."""
         stamps, first = np.unique(np.array(self._stamps_ns, np.int64), return_index=True)
         rows = np.array(self._rows).reshape(-1, 13)[first]
         poses, moving = Trajectory(stamps, rows[:, :3], rows[:, 3:7]), np.isfinite(rows[:, 7])
@@ -196,7 +196,7 @@ class Tally:
         return len(self._stamps_ns)
 
     def column(self, name: str) -> Array:
-        """A number of each of these frames (n,), one of :data:`_COLUMNS`."""
+        """Return a number of each of these frames (n,), one of :data:`_COLUMNS`."""
         table = np.array(self._numbers).reshape(-1, len(_COLUMNS))
         return table[:, _COLUMNS.index(name)].copy()
 
@@ -231,7 +231,7 @@ def write_results(
     start = time.perf_counter()
 
     def localized() -> Iterator[tuple[int, Localized]]:
-        """The frames with a pose, and when they were recorded; the others are counted and kept."""
+        """Yield frames with a pose and their times of recording; count and keep the others."""
         for answer in replay(bag, topics, localizer):
             result = answer.result
             if result:
@@ -278,7 +278,7 @@ _WIDTH = 96  # columns of a terminal that is not narrow
 
 
 def summary(tally: Tally, config: NodeConfig, timed: bool = True) -> list[str]:
-    """Lines of a table, the reasons of refusals explained below.
+    """Return the lines of a table, with the reasons of refusals explained below.
 
     ``timed``: whether to say how fast, which is never the same twice.
     """
@@ -337,7 +337,7 @@ def summary(tally: Tally, config: NodeConfig, timed: bool = True) -> list[str]:
 
 
 def figures(tally: Tally) -> Figures:
-    """Figures of a recording, for the summary of many."""
+    """Return the figures of a recording, for the summary of many."""
     readout_time, deviation = tally.readout or (np.nan, np.nan)
     return {
         "frames": tally.total,

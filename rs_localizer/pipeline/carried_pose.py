@@ -84,7 +84,7 @@ class Drift:
         return found, Drift(np.minimum(squared, _MOST), self.count + 1)
 
     def after(self, seconds: float) -> Array:
-        """Variances (6,) that it adds in so many s."""
+        """Return the variances (6,) that odometry adds in this many seconds."""
         variances: Array = seconds**2 * np.maximum(self.squared, _LEAST)
         return variances
 
@@ -98,7 +98,7 @@ class CarriedPose:
     covariance: Array  # (6,6) of the body's pose then; zero for what is zero in the plane
 
     def body(self, now: Odometry) -> Transform:
-        """``map_from_body`` at another moment."""
+        """Return ``map_from_body`` at another moment."""
         return self.map_from_odom @ now.odom_from_body
 
     def seconds(self, now: Odometry) -> float:
@@ -111,7 +111,7 @@ class CarriedPose:
         return np.concatenate([there.translation - here.translation, turn])
 
     def grown(self, now: Odometry, drift: Drift, axes: list[int]) -> Array:
-        """Covariance (6,6) at another moment, of these of the six numbers."""
+        """Return the covariance (6,6) at another moment, for these of the six numbers."""
         body = self.body(now)
         went = self.map_from_odom.rotation @ (
             now.odom_from_body.translation - self.since.odom_from_body.translation
@@ -146,14 +146,14 @@ class CarriedPose:
         return other if next(volumes) <= next(volumes) else self
 
     def of_transform(self, grown: Array, now: Odometry) -> Array:
-        """Covariance (6,6) of the odometry's origin in the map, from that of the body."""
+        """Convert the covariance (6,6) of the body to that of the odometry's origin in the map."""
         return _moved(grown, self.map_from_odom.translation - self.body(now).translation)
 
 
 def carried_pose(
     now: Odometry, map_from_body: Transform, covariance: Array, axes: list[int]
 ) -> CarriedPose:
-    """The pose of a body, of which odometry says where it has it now."""
+    """Return the pose of a body, with the odometry of its moment."""
     two_d, own = len(axes) == 3, np.ix_(axes, axes)
     kept = np.zeros((6, 6))
     kept[own] = covariance[own]
@@ -161,7 +161,7 @@ def carried_pose(
 
 
 def corrected(map_from_body: Transform, odom_from_body: Transform, *, two_d: bool) -> Transform:
-    """``map_from_odom`` by which odometry has the body where it is in the map.
+    """Return the ``map_from_odom`` with which odometry has the body at its place in the map.
 
     Args:
         two_d: its z, roll and pitch are zero; then the body has its x and y, and the heading of
@@ -179,7 +179,7 @@ def corrected(map_from_body: Transform, odom_from_body: Transform, *, two_d: boo
 
 
 def _moved(covariance: Array, way: Array) -> Array:
-    """Covariance (6,6) of a pose whose origin lies this way (3,) from the other's, map axes."""
+    """Move a covariance (6,6) to a pose whose origin is displaced by (3,), in map axes."""
     jacobian = np.eye(6)
     jacobian[PLACE, TURN] = -so3.hat(way)
     moved: Array = jacobian @ covariance @ jacobian.T
@@ -187,7 +187,7 @@ def _moved(covariance: Array, way: Array) -> Array:
 
 
 def far(offset: Array) -> str:
-    """An offset, or deviations (6,), in words."""
+    """Describe an offset, or deviations (6,), in words."""
     place, turn = np.linalg.norm(offset[PLACE]), np.linalg.norm(offset[TURN])
     metres = f"{100.0 * place:.2g} cm" if place < 0.995 else f"{place:.2g} m"
     return f"{metres}, {math.degrees(float(turn)):.2g} deg"

@@ -17,7 +17,7 @@ class ClockJumps:
         self._steps: deque[int] = deque(maxlen=_REMEMBERED)
 
     def is_jump(self, before_ns: int, step_ns: int) -> bool:
-        """True where what was known of times before has nothing to do with now.
+        """Return True if a step of the clock makes all earlier knowledge useless.
 
         Args:
             before_ns: the clock before this step; 0: it has not been set.

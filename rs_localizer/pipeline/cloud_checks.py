@@ -17,7 +17,7 @@ _SLACK = 1.0
 
 
 def oddities(cloud: Correspondences, camera: Camera, camera_frame: str) -> dict[Notice, str]:
-    """Sentences that say what is odd.
+    """Return sentences on what is odd about a cloud, by notice.
 
     Args:
         cloud: of one image.
@@ -62,7 +62,7 @@ _NAMED = 12
 
 
 def stale_landmarks(cloud: Correspondences, gone: BoolArray) -> str:
-    """A sentence that names the points that are gone from a map; empty where none is."""
+    """Name the points that are gone from a map in a sentence; empty if there are none."""
     if not gone.any():
         return ""
     rows = np.flatnonzero(gone)

@@ -110,7 +110,7 @@ class FrameLocalizer(ABC):
 
     @abstractmethod
     def _new_tracker(self, config: NodeConfig, cameras: Mapping[str, Camera]) -> Tracker:
-        """The tracker of these settings; raises ValueError for those that it refuses."""
+        """Return the tracker of these settings; raises ValueError for those that it refuses."""
 
     @abstractmethod
     def _forget_frames(self) -> None:
@@ -118,7 +118,7 @@ class FrameLocalizer(ABC):
 
     @abstractmethod
     def flush(self) -> list[Localized | Refusal]:
-        """The results of all that still waits, when no more images will come."""
+        """Return the results of frames that still wait for others: none will come."""
 
     @property
     def config(self) -> NodeConfig:
@@ -230,7 +230,7 @@ class FrameLocalizer(ABC):
         self._apply_settings(self._config)
 
     def awaits_imu(self, stamp_ns: int, patience: float) -> bool:
-        """True if readings of the frame with this stamp may yet come within so many s."""
+        """Return True if readings of the frame with this stamp may come within so many seconds."""
         return False
 
     def load_files(self) -> None:
@@ -265,17 +265,17 @@ class FrameLocalizer(ABC):
         self, cloud: Correspondences, estimate: Estimate, moment: tuple[int, float],
         readout_deviation: float = 0.0,
     ) -> Localized:  # fmt: skip
-        """Pose and twist of the first camera at a moment, as of :func:`.of_camera`."""
+        """Return the pose and twist of the first camera at a moment, as of :func:`.of_camera`."""
         first = next(iter(self._cameras.values())).first_row_time
         readout = ReadoutKnown(readout_deviation, first, self.shutter.is_global)
         return of_camera(cloud, estimate, self._config, self.camera_frame, moment, readout)
 
     def mounted(self, localized: Localized) -> Localized | Refusal:
-        """The result of ``base_frame``, from that of the camera."""
+        """Return the result of ``base_frame`` from the result of the camera."""
         return of_body(localized, self.config, self.transforms)
 
     def _checked(self, cloud: Correspondences, name: str = "") -> Correspondences:
-        """With no more points than a camera's part of ``max_points``; what is odd is said."""
+        """Return at most a camera's part of ``max_points``, and give notice of what is odd."""
         camera, of = self._cameras[name], f"{name}: " if name else ""
         for notice, text in oddities(cloud, camera, self.calibrations[name].frame).items():
             self._notice(notice, of + text)
@@ -291,7 +291,7 @@ class FrameLocalizer(ABC):
     def _explained(
         self, refusal: Refusal, tried: Callable[[], str], notice: Notice = Notice.WOULD_FIT
     ) -> Refusal:
-        """The refusal of a frame, with what would fit where somebody found that."""
+        """Return the refusal of a frame, with what would fit if something was found."""
         if refusal.reason not in what_fits.REASONS:
             return refusal
         said = self._mistakes.explain_frame(tried)
@@ -302,7 +302,7 @@ class FrameLocalizer(ABC):
 
 
 def _in_effect(config: NodeConfig) -> NodeConfig:
-    """The settings without what ``refinement`` turns off.
+    """Return the settings without what ``refinement`` turns off.
 
     That is what knows more than a frame's points, and TF where no covariance says how good a pose
     is.
@@ -316,12 +316,12 @@ def _in_effect(config: NodeConfig) -> NodeConfig:
 
 
 def shutters(config: NodeConfig) -> Mapping[str, CameraSettings]:
-    """Readout time, direction and stamp offset of each camera."""
+    """Return the readout time, direction and stamp offset of each camera."""
     own = CameraSettings(config.readout_time, config.scan_direction, config.stamp_offset)
     return config.of_cameras or {"": own}
 
 
 def is_timed(config: NodeConfig, cameras: Mapping[str, Camera]) -> bool:
-    """True if frames tell velocities; without a readout time they predict nothing."""
+    """Return True if frames tell velocities; without a readout time they predict nothing."""
     rolling = find_solver(config.solver).rolling_shutter
     return rolling and all(camera.readout_time > 0.0 for camera in cameras.values())

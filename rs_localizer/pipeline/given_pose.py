@@ -105,7 +105,7 @@ class PosePrior:
         config: NodeConfig,
         transforms: Transforms,
     ) -> Prior | None:
-        """Prior of the camera's motion at a time; None: nothing was given."""
+        """Return the prior of the camera's motion at a time; None if no pose was given."""
         self._expected = None
         given = self.given
         if given is None:
@@ -130,7 +130,7 @@ class PosePrior:
         return self._expected
 
     def judge_result(self, result: Estimate) -> None:
-        """Be done with it, now that a frame has a pose."""
+        """Drop the given pose, now that a frame has a pose."""
         given, expected = self.given, self._expected
         if given is None or expected is None:
             return
@@ -154,7 +154,7 @@ class PosePrior:
 def _of_camera(
     given: GivenPose, body_from_camera: Transform, seconds: float, config: NodeConfig
 ) -> Prior:
-    """The prior of a camera that may have moved for so long since then, as cameras do."""
+    """Return the prior of a camera that may have moved for this long, as cameras do."""
     camera = given.pose @ body_from_camera
     pace = [config.velocity_prior.linear, config.velocity_prior.angular]
     moved = np.repeat(np.square(np.multiply(pace, seconds)), 3)

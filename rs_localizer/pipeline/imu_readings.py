@@ -44,7 +44,7 @@ _LEAST_RATE = 1e9 / LONGEST_PERIOD_NS
 
 
 def in_words(unused: Unused) -> str:
-    """Meaning of a reason, and what was found."""
+    """Describe a reason and what was found."""
     means = IMU_REASONS[unused.reason].means
     return f"{means}: {unused.detail}" if unused.detail else means
 
@@ -122,7 +122,7 @@ class ImuInput:
         )
 
     def awaits(self, tracker: Tracker, config: NodeConfig, time_ns: int, patience: float) -> bool:
-        """True if readings of this exposure are missing that may come within so many seconds."""
+        """Return True if missing readings of this exposure may come within so many seconds."""
         if not self._wanted(config) or tracker.inertial is None:
             return False
         _, end_ns = _exposure(config, time_ns, tracker)
@@ -137,7 +137,7 @@ class ImuInput:
         camera_frame: str,
         transforms: Transforms,
     ) -> ImuSamples | None:
-        """The readings that tell how the camera has turned since its last frame, until this time.
+        """Return the readings from the last frame until this time.
 
         None where there are none, or the frame was the last one so long ago that none counts.
         """
@@ -260,7 +260,7 @@ class ImuInput:
 
 
 def inertial_settings(config: NodeConfig) -> InertialSettings | None:
-    """Settings of the IMU for the tracker; None: there is none to be used."""
+    """Return the IMU settings of the tracker; None if no IMU is to be used."""
     if config.imu.use == ImuUse.NONE:
         return None
     return InertialSettings(
@@ -275,7 +275,7 @@ def inertial_settings(config: NodeConfig) -> InertialSettings | None:
 
 
 def _exposure(config: NodeConfig, time_ns: int, tracker: Tracker) -> tuple[int, int]:
-    """First and last row by the clock of the IMU, as far as that is known."""
+    """Return the times of first and last row by the clock of the IMU, as far as it is known."""
     status = tracker.inertial
     estimated = 0.0 if status is None or math.isnan(status.time_offset) else status.time_offset
     middle_ns = time_ns - round(1e9 * (config.imu.time_offset + estimated))
@@ -290,7 +290,7 @@ def in_camera_axes(
     frames: tuple[str, str],
     now_ns: int,
 ) -> ImuSamples:
-    """The readings as samples: from the axes of the IMU to those of the camera.
+    """Convert readings from the axes of the IMU to samples in those of the camera.
 
     Lever arms do not matter to a rate; what they do to a force is left out.
 

@@ -52,7 +52,7 @@ class Landmarks:
         self.lacking = False
 
     def matching_by(self, keypoints: Keypoints) -> MatchBy | Refusal:
-        """Means by which keypoints can be matched."""
+        """Return the means by which keypoints can be matched."""
         if self._matcher is None:
             self.lacking = True
             return Refusal(
@@ -72,7 +72,7 @@ class Landmarks:
     def match(
         self, keypoints: Keypoints, settings: Matching, camera: Camera, prior: Prior | None
     ) -> Correspondences | Refusal:
-        """Correspondences, all over the map or where a motion predicts them only."""
+        """Match keypoints all over the map, or only where a motion predicts them."""
         assert self._matcher is not None
         matches = self._matcher.match(keypoints, settings, camera, prior)
         if len(matches) == 0:
@@ -86,7 +86,7 @@ class Landmarks:
         return found
 
     def repeated(self, keypoints: Keypoints) -> Correspondences | None:
-        """The last correspondences, if the image is the same, bit for bit; else None."""
+        """Return the last correspondences if the image is the same, bit for bit; else None."""
         if self._last is None:
             return None
         before, found = self._last
@@ -98,7 +98,7 @@ class Landmarks:
 
 
 def read_landmarks(file: str, frame: str) -> Map:
-    """The map of a file, to match keypoints with.
+    """Read the map of a file, to match keypoints with.
 
     Args:
         file: its path; ``~`` is the user's home.
@@ -125,7 +125,7 @@ def read_landmarks(file: str, frame: str) -> Map:
 
 
 def oddities_of_map(landmarks: Map, previous: Map | None) -> dict[Notice, str]:
-    """Sentences on a map that takes the place of another, or of none."""
+    """Return sentences on a map that replaces another one, or none."""
     notices: dict[Notice, str] = {}
     if landmarks.dropped:
         notices[Notice.MAP_INCOMPLETE] = (

@@ -31,7 +31,7 @@ class Extracted:
 
 
 def keypoints(extracted: Extracted, make: Make) -> Any:
-    """The sensor_msgs/PointCloud2 of an image: the same for node and bag."""
+    """Make the sensor_msgs/PointCloud2 of an image, for node and bag alike."""
     features = extracted.features
     width = features.descriptors.shape[1]
     numbers = [(name, "<f4") for name in ("u", "v", "score")]

@@ -96,7 +96,7 @@ class Hypothesis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectionState:
-    """What is remembered; :func:`decide` returns the next."""
+    """State between observations; :func:`decide` returns the next one."""
 
     held: Hypothesis | None = None
     aside: Hypothesis | None = None
@@ -108,7 +108,7 @@ class CorrectionState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
-    """What follows of an observation."""
+    """Consequences of an observation."""
 
     state: CorrectionState
     standing: Standing
@@ -160,7 +160,7 @@ class _Case:
     now: Odometry
 
     def posed(self, found: Hypothesis, doubt: float) -> tuple[CorrectionState, str]:
-        """Return the state after a pose that is wrong with probability ``doubt``, and a text."""
+        """Return the state after a pose, probably right or not, and the sentence to say."""
         state, held, aside, right = self.state, self.held, self.aside, not doubt >= _DOUBTFUL
         if held is not None and self.now.stamp_ns <= held.newest.since.stamp_ns:
             return state, ""
@@ -192,7 +192,7 @@ class _Case:
         return replace(state, held=found, aside=None, base=found.pose), said
 
     def clicked(self, found: Hypothesis) -> tuple[CorrectionState, str]:
-        """The state after a user's pose, and the answer."""
+        """Return the state after a user's pose, and the answer."""
         state, held = self.state, self.held
         for known, text in ((held, "as a measurement"), (self.aside, "for what contradicts it")):
             if known and known.seen_ns > 0 and self._passes(self._misfit(known, found)):
@@ -213,7 +213,7 @@ class _Case:
         )
 
     def decision(self, said: str) -> Decision:
-        """What is to be sent now."""
+        """Return the transform to send now."""
         state, held, aside = self.state, self.state.held, self.aside
         if held is None:
             return Decision(state, Standing.LOST, said=said)
@@ -235,14 +235,14 @@ class _Case:
 
     @property
     def held(self) -> Hypothesis | None:
-        """What is held and not given up."""
+        """Hypothesis that is held and not given up."""
         held, hold = self.state.held, self.settings.hold
         ended = held is not None and 0.0 < hold < held.newest.seconds(self.now)
         return None if ended else held
 
     @property
     def aside(self) -> Hypothesis | None:
-        """What contradicts it; not a few poses of which nothing followed."""
+        """Hypothesis that contradicts the held one; None for a few poses without consequence."""
         aside = self.state.aside
         brief = aside is None or aside.told or aside.newest.seconds(self.now) < _BRIEF
         return aside if brief else None
@@ -251,7 +251,7 @@ class _Case:
         return pose.grown(self.now, self.state.drift, self.settings.axes)
 
     def _misfit(self, known: Hypothesis | None, found: Hypothesis) -> tuple[float, float]:
-        """Squared distance in deviations, and minus twice the likelihood's logarithm, less 2 pi."""
+        """Return the squared distance in deviations, and -2 log likelihood less 2 pi."""
         if known is None:
             return math.inf, math.inf
         spread, offset = self._spread(known, found), known.pose.offset(found.pose, self.now)
@@ -271,14 +271,14 @@ class _Case:
         return misfit[0] <= _GATES[len(self.settings.axes)]
 
     def _reachable(self, held: Hypothesis, aside: Hypothesis | None, found: Hypothesis) -> bool:
-        """Whether a body can have come from the last pose to a new one, whatever odometry says."""
+        """Return whether a body can have got from the last pose to a new one, despite odometry."""
         gate = _GATES[len(self.settings.axes)]
         if aside and aside.told and not (aside.reachable and self._near(aside, found, gate)):
             return False
         return self._near(held, found, _SLACK)
 
     def _near(self, known: Hypothesis, found: Hypothesis, slack: float) -> bool:
-        """Whether only noise is beyond what a body goes, from where odometry had it or it was."""
+        """Return whether a pose is within reach of the known or carried one, but for noise."""
         reach = np.multiply((_PACE, _SPIN), 1e-9 * (self.now.stamp_ns - known.near_ns))
         stayed = known.pose.body(known.newest.since) @ self.now.odom_from_body.inverse()
         for start in (known.pose, replace(known.pose, map_from_odom=stayed)):
@@ -290,7 +290,7 @@ class _Case:
         return False
 
     def _renewed(self, known: Hypothesis, found: Hypothesis, most: float) -> Hypothesis:
-        """A hypothesis by its newest pose, with a support of so many s at most."""
+        """Return a hypothesis with its newest pose, and a support of at most so many seconds."""
         since = max(1e-9 * (self.now.stamp_ns - known.near_ns), 0.0)
         support = min(known.support + min(since, _STEP), most)
         measured = found.pose, self.now, self.state.drift, self.settings.axes

@@ -47,7 +47,7 @@ class Detected:
 
 
 def correspondences(detected: Detected, make: Make) -> Any:
-    """The sensor_msgs/PointCloud2 of an image: the same for node and bag."""
+    """Make the sensor_msgs/PointCloud2 of an image, for node and bag alike."""
     detections = detected.detections
     rows = np.empty(len(detections.ids), detected.row)
     for column, name in enumerate("xyz"):

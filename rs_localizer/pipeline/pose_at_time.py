@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pose and twist of the body at one moment of a motion, with covariances in REP-103's order.
 
-The estimate is centred on the middle row and counts time in readouts; what is published holds at
-one moment, in SI units, and orders its covariance as REP-103 does. First-order propagation, with
-``R = map_from_camera`` and ``c`` the camera centre at ``tau = 0``, the turn ``theta = tau omega +
-tau^2/2 alpha`` and the way ``w = tau v + tau^2/2 a`` since then, and the estimate's errors ``phi,
-rho, d_omega, d_v, d_alpha, d_a`` in its own order:
+The estimate is centred on the middle row and counts time in readouts. A published pose holds at one
+moment, in SI units, and its covariance has the order of REP-103. Errors are propagated to first
+order. ``R = map_from_camera`` and ``c``, the camera centre, are at ``tau = 0``; the rotation since
+then is ``theta = tau omega + tau^2/2 alpha``, the way ``w = tau v + tau^2/2 a``. The estimate's
+errors in its own order are ``phi, rho, d_omega, d_v, d_alpha, d_a``:
 
     rotation(tau) = R exp(phi) exp(theta + d_theta)
                   = exp(R (phi + J(theta) d_theta)) R exp(theta)
@@ -20,12 +20,13 @@ rho, d_omega, d_v, d_alpha, d_a`` in its own order:
 where J is the left Jacobian of SO(3): ``exp(a + d) = exp(J(a) d) exp(a)``; it is the right one of
 ``-a``. Without acceleration the body rate is ``omega`` at any time; second orders of the
 acceleration are left out.
-Shaking turns the camera by ``delta(tau)`` in its own axes beside all that; its coefficients stand
-behind the motion in the estimate's covariance, and its turn and rate are linear in them. What a
-gyroscope knows of the turn comes last: what is said above is of the motion beside it, and then
-turned by it; its own noise at one moment is added to the angular velocity's. Where the gyroscope
-alone knows the angular velocity of that moment better than motion and turn together, because its
-time offset leaves the motion beside the turn to the points, its own is published.
+
+Vibration rotates the camera by ``delta(tau)`` in its own axes beside this motion. Its coefficients
+stand behind the motion in the estimate's covariance, and its rotation and rate are linear in them.
+The rotation of a gyroscope comes last: the equations hold for the motion beside it, which is then
+rotated by it. The gyroscope's noise at one moment is added to that of the angular velocity. Its
+time offset may leave the motion beside the rotation to the points. If the gyroscope alone then
+knows the angular velocity better than both together, its own is published.
 """
 
 from dataclasses import replace
@@ -44,7 +45,7 @@ from rs_localizer.io.outputs import BodyPose, Twist
 
 
 def pose_at(estimate: Estimate, tau: float) -> BodyPose:
-    """Pose of the camera in the map at row time ``tau``."""
+    """Return the pose of the camera in the map at row time ``tau``."""
     position, rotation, covariance = pose_of(
         *_numbers(estimate, tau), beyond_rows(estimate, tau)[0]
     )
@@ -52,7 +53,7 @@ def pose_at(estimate: Estimate, tau: float) -> BodyPose:
 
 
 def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
-    """Twist of the camera at row time ``tau``, in its axes at that moment; readout_time in s."""
+    """Return the twist at row time ``tau``, in camera axes then; readout_time in s."""
     linear, angular, covariance = twist_of(*_numbers(estimate, tau), beyond_rows(estimate, tau))
     return Twist(
         linear=linear / readout_time,
@@ -62,7 +63,7 @@ def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
 
 
 def _numbers(estimate: Estimate, tau: float) -> tuple[Numbers, Array, Array, Turning, float]:
-    """An estimate at a row time, as kernels take it."""
+    """Return the numbers of an estimate at a row time, as kernels take them."""
     turn = NO_TURN if estimate.turn is None else estimate.turn.numbers
     joint = np.ascontiguousarray(estimate.joint_covariance.copy())
     joint[:MOTION_PARAMETERS, :MOTION_PARAMETERS] = estimate.covariance
@@ -72,7 +73,7 @@ def _numbers(estimate: Estimate, tau: float) -> tuple[Numbers, Array, Array, Tur
 def with_timing(
     pose: BodyPose, twist: Twist, deviation: float, delay: float, acceleration: Acceleration
 ) -> tuple[BodyPose, Twist]:
-    """The covariances with what is not known of the readout time.
+    """Add the uncertainty of the readout time to the covariances.
 
     Args:
         pose, twist: of the camera at one moment.
@@ -92,13 +93,13 @@ def with_timing(
 
 
 def middle_row_ns(config: NodeConfig, camera: Camera, stamp_ns: int) -> int:
-    """Time at which the middle row of the image with this stamp was exposed."""
+    """Return the time at which the middle row of the image with this stamp was exposed."""
     delay = config.stamp_offset - config.readout_time * camera.first_row_time
     return stamp_ns + round(delay * 1e9)
 
 
 def published_moment(config: NodeConfig, camera: Camera, stamp_ns: int) -> tuple[int, float]:
-    """The stamp for which a pose is published, and the row time of that moment."""
+    """Return the stamp of the published pose, and the row time of that moment."""
     if config.pose_time == PoseTime.MID_FRAME:
         return middle_row_ns(config, camera, stamp_ns), 0.0
     tau = camera.first_row_time

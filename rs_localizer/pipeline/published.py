@@ -1,10 +1,10 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Published frames: the moment, the velocities, and the way from the camera to ``base_frame``.
+"""Published frames: the moment, the velocities, and the transform to ``base_frame``.
 
-With ``R = map_from_camera`` and ``p`` the camera's position, the camera's velocities ``v, w`` in
-its own axes, and the mounting ``camera_from_base`` with rotation ``C`` and translation ``r`` (where
-the base's origin is in camera axes), pose, twist and errors of ``base_frame`` are:
+``R = map_from_camera`` and ``p`` are the camera's pose, ``v, w`` its velocities in its own axes.
+The mount ``camera_from_base`` has the rotation ``C`` and the translation ``r``, the base's origin
+in camera axes. Pose, twist and errors of ``base_frame`` are:
 
     position   p + R r                 error  dp + theta x R r
     rotation   R C                     error  theta, about the fixed axes of the map
@@ -49,7 +49,7 @@ class Mounting:
 def find_mounting(
     transforms: Transforms, camera: str, base: str, stamp_ns: int | None, span_ns: int
 ) -> Mounting:
-    """The mounting at a time, from the transforms between two frames.
+    """Return the mount at a time, from the transforms between two frames.
 
     Args:
         transforms: where they come from.
@@ -76,7 +76,7 @@ def find_mounting(
 
 
 def base_pose(camera: BodyPose, mounting: Mounting) -> BodyPose:
-    """Pose of the base in the map, from that of the camera."""
+    """Return the pose of the base in the map, from the pose of the camera."""
     lever = camera.rotation @ mounting.camera_from_base.translation
     jacobian = np.eye(6)
     jacobian[_LINEAR, _ANGULAR] = -so3.hat(lever)
@@ -88,7 +88,7 @@ def base_pose(camera: BodyPose, mounting: Mounting) -> BodyPose:
 
 
 def base_twist(camera: Twist, mounting: Mounting) -> Twist:
-    """Velocity of the base with respect to the map, in base axes, from that of the camera."""
+    """Return the velocity of the base in the map, in base axes, from that of the camera."""
     base_from_camera = mounting.camera_from_base.rotation.T
     lever = mounting.camera_from_base.translation
     linear = camera.linear + np.cross(camera.angular, lever) + mounting.linear
@@ -124,7 +124,7 @@ def of_camera(
     moment: tuple[int, float],
     readout: ReadoutKnown,
 ) -> Localized:
-    """Pose and twist of the camera's, or a rig's first camera's, optical frame at a moment.
+    """Return pose and twist of the optical frame of the (first) camera at a moment.
 
     Args:
         cloud: with the rows of the estimate, or with none.
@@ -160,7 +160,7 @@ def of_camera(
 def of_body(
     localized: Localized, config: NodeConfig, transforms: Transforms
 ) -> Localized | Refusal:
-    """The same of ``base_frame``, from that of the camera."""
+    """Return the result of ``base_frame`` from the result of the camera."""
     base = config.base_frame
     if base in ("", localized.body_frame):
         return localized
@@ -203,7 +203,7 @@ def check_time(frame: Localized) -> None:
 
 
 def pose_in_odometry(frame: Localized, config: NodeConfig, transforms: Transforms) -> FoundPose:
-    """A frame's pose with what odometry says of its time, for :func:`.decide`.
+    """Return a frame's pose with the odometry at its time, for :func:`.decide`.
 
     Raises:
         TransformError: when the frame says nothing of its time, or odometry says nothing for it.
@@ -218,7 +218,7 @@ def pose_in_odometry(frame: Localized, config: NodeConfig, transforms: Transform
 def broadcast(
     frame: Localized, config: NodeConfig, transforms: Transforms, state: CorrectionState
 ) -> tuple[Broadcast | None, CorrectionState]:
-    """The transform to publish of a frame, if there is one, and the next state of ``map -> odom``.
+    """Return the transform to publish of a frame, if any, and the next state of ``map -> odom``.
 
     Raises:
         TransformError: when the frame says nothing of its time, or odometry says nothing for it.

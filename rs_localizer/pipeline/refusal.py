@@ -44,7 +44,7 @@ def unheard(notice: Notice | ImuReason, text: str) -> None:
 
 
 def read_or_refuse(read: Callable[[Any], Read], message: Any, reason: Reason) -> Read | Refusal:
-    """Content of a message; refused for this reason if it cannot be read, or as empty."""
+    """Read a message, or refuse it for this reason, or as empty."""
     try:
         return read(message)
     except EmptyCloudError as error:
@@ -177,6 +177,6 @@ IMU_REASONS: dict[str, Meaning] = {
 
 
 def explained(reason: str) -> str:
-    """One line about a reason; empty for one that is in no table."""
+    """Explain a reason in one line; empty for one that is in no table."""
     meaning = {**REASONS, **IMU_REASONS}.get(reason)
     return "" if meaning is None else f"{meaning.means}; {meaning.look_at}"

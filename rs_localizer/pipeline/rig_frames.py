@@ -80,7 +80,7 @@ class FrameAssembler:
         self._gone_back: set[str] = set()
 
     def add(self, image: CameraImage) -> list[list[CameraImage]]:
-        """The frames that are complete with this image: none, one or two."""
+        """Return the frames that are complete with this image: none, one or two."""
         if not self._is_usable(image):
             return []
         frames = []
@@ -94,18 +94,18 @@ class FrameAssembler:
         return frames
 
     def flush(self) -> list[list[CameraImage]]:
-        """Frames that are left when no more images will come."""
+        """Return the frames that are left when no more images will come."""
         return [self._complete()] if self._waiting else []
 
     def _belongs(self, image: CameraImage) -> bool:
-        """True if an image is of the frame that waits."""
+        """Return True if an image belongs to the frame that waits."""
         return image.camera not in self._waiting and all(
             abs(image.middle_ns - other.middle_ns) <= self._window_ns
             for other in self._waiting.values()
         )
 
     def _is_usable(self, image: CameraImage) -> bool:
-        """True if an image can be of the frame that waits, or of the next one."""
+        """Return True if an image can belong to the frame that waits, or to the next one."""
         name, time_ns = image.camera, image.middle_ns
         before = self._stamps.get(name)
         if before is not None and time_ns < before:
@@ -139,7 +139,7 @@ class FrameAssembler:
         return self._last_ns is not None and time_ns - self._last_ns > _LONGEST_STEP * 1e9
 
     def _complete(self) -> list[CameraImage]:
-        """The frame that waits, in the order of the names."""
+        """Return the frame that waits, in the order of the names."""
         frame = [self._waiting[name] for name in self._names if name in self._waiting]
         self._waiting = {}
         self._last_ns = max(image.middle_ns for image in frame)
@@ -156,7 +156,7 @@ class FrameAssembler:
 
 
 def matches_of(cloud: Correspondences, images: Sequence[CameraImage]) -> tuple[Array, ...]:
-    """Points and pixels of an image; with scores, where all images have them."""
+    """Return points and pixels of an image, with scores if all images have them."""
     if any(image.cloud.scores is None for image in images):
         return cloud.points, cloud.pixels
     assert cloud.scores is not None
@@ -164,13 +164,13 @@ def matches_of(cloud: Correspondences, images: Sequence[CameraImage]) -> tuple[A
 
 
 def joined(names: Sequence[str], images: Sequence[CameraImage]) -> Correspondences:
-    """Correspondences of all images with the stamp of the first; ``names``: of all cameras."""
+    """Join correspondences of all images, with the stamp of the first; ``names``: all cameras."""
     dropped = sum(image.cloud.dropped for image in images)
     return replace(images[0].cloud, table=_table(names, images), dropped=dropped)
 
 
 def _table(names: Sequence[str], images: Sequence[CameraImage]) -> NDArray[Any]:
-    """The rows of all images, of the fields that all have, and which of the cameras it was."""
+    """Return the rows of all images, with the fields that all have, and their camera."""
     types = [image.cloud.table.dtype for image in images]
     fields = [name for name in types[0].names or () if all(name in (t.names or ()) for t in types)]
     kinds: list[tuple[str, Any]] = [
@@ -188,7 +188,7 @@ def _table(names: Sequence[str], images: Sequence[CameraImage]) -> NDArray[Any]:
 
 
 def share_of(image: CameraImage, result: RigEstimate) -> CameraShare:
-    """Contribution of one camera to an estimate."""
+    """Return the contribution of one camera to an estimate."""
     name = image.camera
     assert isinstance(result.inliers, ByCamera)  # as all of a rig
     assert isinstance(result.residuals, ByCamera)
@@ -227,7 +227,7 @@ class RigFrames(FrameLocalizer):
         pass  # what waits for other images is no previous frame
 
     def _mounted_cameras(self, cameras: Mapping[str, Camera]) -> Rig:
-        """The rig of the cameras whose mounting is known; before there is one, of any."""
+        """Return the rig of the cameras whose mounting is known; before there is one, of any."""
         mounts = self._mounts or dict.fromkeys(cameras, Transform(np.eye(3), np.zeros(3)))
         return Rig(
             {name: cameras[name] for name in mounts},
@@ -274,13 +274,13 @@ class RigFrames(FrameLocalizer):
             yield self._localize_frame(images)
 
     def flush(self) -> list[Localized | Refusal]:
-        """The results of images that still wait for other cameras' images: none will come."""
+        """Return results of images that still wait for other cameras' images: none will come."""
         return [self._localize_frame(frame) for frame in self._assembler.flush()]
 
     def _read(
         self, name: str, kind: str, message: Any, camera: Camera
     ) -> Correspondences | Refusal:
-        """Correspondences of one camera's message."""
+        """Return the correspondences of one camera's message."""
         read: Callable[[Any], Any]
         read = read_correspondences if kind == CORRESPONDENCES else read_keypoints
         found: Correspondences | Keypoints | Refusal
@@ -354,7 +354,7 @@ class RigFrames(FrameLocalizer):
     def _localized(
         self, images: Sequence[CameraImage], result: RigEstimate, origin_ns: int
     ) -> Localized:
-        """Pose and twist of the rig's axes at the published moment."""
+        """Return the pose and twist of the rig's axes at the published moment."""
         config, first = self._config, images[0].cloud
         time_ns = origin_ns + round(1e9 * result.time)
         stamp_ns = time_ns if config.pose_time == PoseTime.MID_FRAME else first.stamp_ns

@@ -32,7 +32,7 @@ def save_pose(file: Path, map_frame: str, map_from_body: Transform, covariance: 
 
 
 def load_pose(file: Path) -> GivenPose | None:
-    """The pose of a file, as a click now; None: there is none yet.
+    """Load the pose of a file, as a click now; None if there is no file yet.
 
     Raises:
         ValueError: for a file that holds something else, saying what.

@@ -39,12 +39,12 @@ class Stream:
         self.reset()
 
     def reset(self) -> None:
-        """The next frame is the first."""
+        """Forget all frames: the next one is the first."""
         self._last: tuple[int, str] | None = None  # stamp and map frame of the frame before
         self._places: deque[tuple[int, Array, float]] = deque()  # ns, m, m^2
 
     def unset(self, stamp_ns: int) -> Refusal | None:
-        """A refusal of an image of which the sender gives no time."""
+        """Refuse an image whose sender gives no time."""
         if stamp_ns or self.zero_is_time:
             return None
         return Refusal(Reason.NO_STAMP, "header.stamp is 0: its sender does not set it")
@@ -112,7 +112,7 @@ class Stream:
 
 
 def _speed(places: Sequence[tuple[int, Array, float]]) -> float:
-    """How fast poses of times (ns) and variances (m^2) go, m/s: median of steps of some length.
+    """Return the speed (m/s) of poses with times (ns) and variances (m^2): a median of steps.
 
     A hand goes to and fro: from end to end of the window it comes nowhere.
     """

@@ -54,7 +54,7 @@ class Tags:
         self._agreed = self._images = 0
 
     def match(self, message: Any) -> Correspondences | Refusal:
-        """Correspondences of an AprilTagDetectionArray; never raises for a bad one."""
+        """Match an AprilTagDetectionArray with the map; a bad one is refused, never raised."""
         detections = read_or_refuse(read_detections, message, Reason.BAD_DETECTIONS)
         if isinstance(detections, Refusal):
             return detections
@@ -71,7 +71,7 @@ class Tags:
         return self._correspondences(detections)
 
     def _known(self, detections: TagDetections) -> IntArray:
-        """The first row of each tag (m,) in the map's points; -1: it is not used."""
+        """Return the first row of each tag (m,) in the map's points; -1 if it is not used."""
         keys = [
             (self._kinds.get(name, name), number)
             for name, number in zip(detections.families, detections.ids.tolist(), strict=True)
@@ -89,7 +89,7 @@ class Tags:
         return rows
 
     def _other_order(self, detections: TagDetections) -> str | None:
-        """The fault of the order of the corners, if another one fits the map."""
+        """Describe the fault of the corners' order, if another one fits the map."""
         self._images += 1
         if len(detections.ids) < 2 or (self._agreed >= _AGREED and self._images % _ONE_IN):
             return None
@@ -111,7 +111,7 @@ class Tags:
         return None
 
     def _neighbours(self, detections: TagDetections) -> IntArray:
-        """The two tags (2,) whose middles are nearest to each other in the map."""
+        """Return the two tags (2,) whose middles are nearest to each other in the map."""
         middles = self._points[detections.ids[:, None] + np.arange(4)].mean(axis=1)
         apart = np.linalg.norm(middles[:, None] - middles, axis=2)
         np.fill_diagonal(apart, np.inf)
@@ -134,7 +134,7 @@ class Tags:
 
 
 def read_tags(file: str, notice: Notify) -> Tags:
-    """The tags of a map file; ``~`` is the user's home.
+    """Read the tags of a map file; ``~`` is the user's home.
 
     Raises:
         MarkerMapError: for a file that cannot be used.

@@ -56,7 +56,7 @@ def _exchanged(frame: _Frame) -> Array | None:
 
 
 def _half_turned(frame: _Frame) -> Array | None:
-    """Pixels of which each corner has those of the opposite one; None: there are no such ids."""
+    """Give each corner the pixel of the opposite one; None if there are no such ids."""
     if frame.ids is None:
         return None
     place = {id_: row for row, id_ in enumerate(frame.ids.tolist())}
@@ -113,7 +113,7 @@ def what_fits(
 
 
 def _is_flat(points: Array) -> bool:
-    """Whether points lie in a plane: mirrored, it is one that is seen from behind, and fits."""
+    """Return whether points lie in a plane: a mirrored plane is seen from behind, and fits."""
     if len(points) < 4:
         return True
     extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
@@ -152,7 +152,7 @@ def cameras_apart(
 
 
 def ids_of(cloud: Correspondences) -> IntArray | None:
-    """The ids of a cloud's points, if it has any."""
+    """Return the ids of a cloud's points, if it has any."""
     return cloud.table["id"].astype(np.int64) if "id" in (cloud.table.dtype.names or ()) else None
 
 

@@ -62,7 +62,7 @@ class ExampleMatcher(Node):
         )
 
     def _schedule(self) -> Any:
-        """Times (ns) at which messages are due, their topics and the messages, for ever."""
+        """Yield times (ns) at which messages are due, topics and messages, for ever."""
         stamps = [stamp_ns(message) for _, message in self._messages]
         length = stamps[-1] - stamps[0] + _PERIOD_NS
         start = self.get_clock().now().nanoseconds + 10**9 - stamps[0]

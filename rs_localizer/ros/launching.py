@@ -46,7 +46,7 @@ CAMERA = {
 
 
 def share(*path: str) -> PathJoinSubstitution:
-    """A file that the package installs."""
+    """Return the path of a file that the package installs."""
     return PathJoinSubstitution([FindPackageShare(PACKAGE), *path])
 
 
@@ -55,7 +55,7 @@ def description(
     kinds: Iterable[Kind] = (),
     others: Mapping[str, tuple[str, str]] | None = None,
 ) -> LaunchDescription:
-    """Arguments, and what to start once they are known; RViz if it is asked for.
+    """Return the launch arguments, and what to start once they are known; RViz if wanted.
 
     Args:
         nodes: to start, given the arguments.
@@ -101,7 +101,7 @@ def description(
 
 
 def _is_launched() -> bool:
-    """True if a file of this package is launched, and none of others that includes it.
+    """Return True if a file of this package is launched, and not included by another one.
 
     Arguments of such a file may be its own, and nobody tells which it has.
     """
@@ -122,12 +122,12 @@ def refuse_unknown(words: Iterable[str], own: Iterable[str]) -> None:
 
 
 def _file_of(kind: Kind) -> str:
-    """The argument that names the params file of a node."""
+    """Return the argument that names the params file of a node."""
     return "params_file" if kind is NodeConfig else f"{NODES[kind]}_params_file"
 
 
 def given(texts: Texts, kind: Kind = NodeConfig) -> dict[str, Any]:
-    """The settings of a node among the launch arguments.
+    """Return the settings of a node among the launch arguments.
 
     Raises:
         ValueError: for a value that the node would refuse: the launch fails at once.
@@ -142,12 +142,12 @@ def given(texts: Texts, kind: Kind = NodeConfig) -> dict[str, Any]:
 
 
 def _of_rig(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The cameras of a rig may have their readout times in the params file."""
+    """Return the cameras of a rig, whose readout times may be in the params file."""
     return {"readout_time": 0.01} if "cameras" in values and "readout_time" not in values else {}
 
 
 def _read(text: str, default: Any) -> Any:
-    """The value that a text says; the text where it says none of this type, which is refused."""
+    """Read the value of a text; a text of another type stays, and is refused later."""
     if isinstance(default, str):
         return text
     if default == NO_NAMES:
@@ -164,7 +164,7 @@ def node(
     values: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Node:
-    """A node of this package; when it ends, everything does.
+    """Return a node of this package; when it ends, everything does.
 
     Args:
         texts: the launch arguments.
@@ -200,7 +200,7 @@ def node(
 
 
 def from_camera(texts: Texts, kind: Kind, values: Mapping[str, Any] | None = None) -> list[Node]:
-    """The camera's driver, if it is asked for, a detector of this kind and the localizer.
+    """Return the camera's driver, if wanted, a detector of this kind and the localizer.
 
     Args:
         values: settings of the localizer instead of those that were given.
@@ -223,7 +223,7 @@ def from_camera(texts: Texts, kind: Kind, values: Mapping[str, Any] | None = Non
 
 
 def with_board(texts: Texts) -> dict[str, Any]:
-    """Settings of a localizer beside a marker detector: how well the boards of its map are known.
+    """Return settings beside a marker detector: the deviation of the boards in its map.
 
     What was given, or stands in its params file, counts more.
     """

@@ -49,7 +49,7 @@ _PROGRAMS = {
 
 
 def answer(name: str, words: Sequence[str]) -> str | None:
-    """The text that is asked for; None when a program is to start.
+    """Return the text that is asked for; None if a program is to start.
 
     Args:
         name: of the executable.

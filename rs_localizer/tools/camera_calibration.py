@@ -49,7 +49,7 @@ _BLOCK_SECONDS, _LEAST_BLOCKS, _MOST_BLOCKS = 3.0, 3, 8
 def blocks_of(
     camera: Camera, observations: SplineKeypoints, whole: Fit, count: int | None = None
 ) -> tuple[Block, ...]:
-    """Equal parts of the recording, each with a lens and a shape of the map of its own.
+    """Return equal parts of the recording, each with its own lens and shape of the map.
 
     Args:
         camera: whose lens the whole was started from.
@@ -85,7 +85,7 @@ def _delay(own: Fit) -> tuple[float, float]:
 
 
 def cut(state: Unknowns, start: float, end: float) -> Unknowns | None:
-    """The state with the motion between two times only."""
+    """Return the state with the motion between two times only."""
     layout = state.spline.layout
     intervals = np.column_stack([layout.starts, layout.ends])
     margin = max(abs(one.readout_time) for one in (state, *state.others))
@@ -158,7 +158,7 @@ def calibrate(
     own_stamps: bool = True,
     done: Callable[[], object] = lambda: None,
 ) -> CameraCalibration:
-    """Readout time, and lens, of a camera from a recording in which it moves.
+    """Estimate readout time and lens of a camera from a recording in which it moves.
 
     Args:
         camera: its lens, and the axis and assumed direction of its scan; not its readout time.
@@ -203,7 +203,7 @@ def calibrate(
 
 
 def _thinned(images: list[ImagePoints]) -> list[ImagePoints]:
-    """Images with no more keypoints in all than are worth their time, others in each image."""
+    """Thin images to as many keypoints as are worth their time, others in each image."""
     every = sum(len(image.points) for image in images) / _MOST_SIGHTS
     if every <= 1.0:
         return images
@@ -228,7 +228,7 @@ def _freedom(observations: SplineKeypoints, intrinsics: bool) -> Freedom:
 
 
 def _best(camera: Camera, posed: Posed, interval: float, freedom: Freedom) -> Fit:
-    """Readout time first, then all that is free, then the images' times and finer knots."""
+    """Fit the readout time, then all that is free, then the images' times and finer knots."""
     spacing = min(LONGEST_SPACING, interval)
     spline = first_spline(posed.times, posed.rotations, posed.positions, spacing, 0.5 * interval)
     observations = within(posed.observations, spline)
@@ -251,7 +251,7 @@ def _best(camera: Camera, posed: Posed, interval: float, freedom: Freedom) -> Fi
 def _unsteady(
     camera: Camera, observations: SplineKeypoints, fitted: Fit, interval: float, freedom: Freedom
 ) -> Fit:
-    """With a time of its own for each image, from tight to loose to what they turn out to be."""
+    """Fit a time of its own for each image, from tight to loose to its actual spread."""
     own, other = _calm(fitted.state, freedom), fitted
     for share in _FIRST_JITTERS:
         own = replace(own, stamps=share * interval)
@@ -261,7 +261,7 @@ def _unsteady(
 
 
 def _jitter(camera: Camera, observations: SplineKeypoints, state: Unknowns) -> float:
-    """Distances of the images' own times from their stamps, s rms.
+    """Return the rms distance (s) of the images' own times from their stamps.
 
     By how one image differs from the mean of its neighbours: times that drift are nearly a motion
     that drifts. And by the fast images: in slow ones a hundredth of a pixel, which may be the
@@ -276,7 +276,7 @@ def _jitter(camera: Camera, observations: SplineKeypoints, state: Unknowns) -> f
 
 
 def _calm(state: Unknowns, freedom: Freedom) -> Freedom:
-    """With a prior of the accelerations that the motion itself shows."""
+    """Add a prior of the accelerations that the motion itself shows."""
     layout = state.spline.layout
     states = state.spline.states(layout.control_times())
     angular, linear = (
@@ -291,7 +291,7 @@ def _calm(state: Unknowns, freedom: Freedom) -> Freedom:
 
 
 def within(observations: SplineKeypoints, spline: Spline) -> SplineKeypoints:
-    """Those keypoints that the motion covers."""
+    """Return the keypoints that the motion covers."""
     return observations.subset(spline.layout.inside(observations.times))
 
 
@@ -350,7 +350,7 @@ def _values_of(blocks: tuple[Block, ...], name: str) -> Array:
 
 
 def _interval_share(fitted: Fit, stamps: Stamps) -> float:
-    """Deviation of the interval, as a share, where stamps are even and the images were not."""
+    """Return the relative deviation of the interval, if stamps are even and images were not."""
     # So many images know a variance no better than that.
     chance = 1.0 + 2.0 * math.sqrt(2.0 / len(fitted.state.delays))
     unsaid = fitted.freedom.stamps**2 - chance * stamps.jitter**2

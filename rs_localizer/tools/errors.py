@@ -36,7 +36,7 @@ class Errors(NamedTuple):
 
 
 def associate(estimated: Stamps, true: Stamps) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of times (n,), and for each the row of the nearest of (m,), increasing, if it is near.
+    """Match times (n,) with the nearest of (m,), increasing, if it is near; return both rows.
 
     Both ns.
     """
@@ -49,7 +49,7 @@ def associate(estimated: Stamps, true: Stamps) -> tuple[NDArray[np.intp], NDArra
 
 
 def errors_of(estimate: Motions, truth: Motions) -> dict[str, Errors]:
-    """Errors by what they are of, in :data:`UNITS`; of twists where both have them."""
+    """Return errors by quantity, in :data:`UNITS`; of twists if both have them."""
     rows, true_rows = associate(estimate.poses.stamps_ns, truth.poses.stamps_ns)
     poses, true = estimate.poses.part(rows), truth.poses.part(true_rows)
     turns = np.zeros(0)
@@ -72,7 +72,7 @@ def _lengths(vectors: Array) -> Array:
 
 
 def draw(methods: Mapping[str, Mapping[str, Errors]], path: Path) -> None:
-    """Errors of one or two methods over time, on logarithmic scales, with running medians.
+    """Draw errors of one or two methods over time, on log scales, with running medians.
 
     The file's description holds the medians, so that a page can be compared with its picture.
     """
@@ -101,7 +101,7 @@ def draw(methods: Mapping[str, Mapping[str, Errors]], path: Path) -> None:
 
 
 def by_evo(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
-    """ATE and RPE after Umeyama's alignment of the positions, by name and unit.
+    """Return ATE and RPE after Umeyama's alignment of the positions, by name and unit.
 
     Raises:
         ImportError: without evo.

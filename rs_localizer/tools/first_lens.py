@@ -36,7 +36,7 @@ _CELLS = 64  # along the longer side
 
 
 def covered(size: tuple[int, int], images: Iterable[Array]) -> float:
-    """Share of an image within what its pixels (n,2) enclose in any of some images."""
+    """Return the share of an image inside the hull of its pixels (n,2) in any of some images."""
     shape = np.maximum(np.ceil(_CELLS * np.array(size) / max(size)), 1.0).astype(int)
     mask = np.zeros(shape[::-1], np.uint8)
     for pixels in images:
@@ -79,7 +79,7 @@ _FLAT = 1e-6  # thickness of a plane by its size
 
 
 def first_lens(size: tuple[int, int], images: list[ImagePoints]) -> Camera:
-    """A lens of the simplest model that predicts images it has not seen as well as any.
+    """Return a lens of the simplest model that predicts unseen images as well as any.
 
     Args:
         size: width and height, pixels.
@@ -119,7 +119,7 @@ def _of_simplest_model(size: tuple[int, int], images: list[ImagePoints]) -> Came
 
 
 def _unseen_error(lens: Camera, images: list[ImagePoints], candidate: _Candidate) -> float:
-    """Error (px rms) of each half of the images under a lens of the other half."""
+    """Return the error (px rms) of each half of the images under a lens of the other half."""
     halves = images[::2], images[1::2]
     squared, count = 0.0, 0
     for known, unseen in (halves, halves[::-1]):
@@ -133,7 +133,7 @@ def _unseen_error(lens: Camera, images: list[ImagePoints], candidate: _Candidate
 
 
 def reprojection_error(camera: Camera, image: ImagePoints) -> float:
-    """Error (px rms of u and v together) of the best global-shutter pose; infinite without one."""
+    """Return the error (px rms of u and v) of the best global-shutter pose, or infinity."""
     pose = _pose(camera, image)
     if pose is None:
         return np.inf
@@ -143,7 +143,7 @@ def reprojection_error(camera: Camera, image: ImagePoints) -> float:
 
 
 def _pose(camera: Camera, image: ImagePoints) -> tuple[Array, Array] | None:
-    """Rotation (3,3) and translation (3,) of the best pose; None as for an infinite error."""
+    """Return rotation (3,3) and translation (3,) of the best pose; None for an infinite error."""
     rays = camera.rays(image.pixels)
     if not np.isfinite(rays).all():
         return None
@@ -165,7 +165,7 @@ def _pose(camera: Camera, image: ImagePoints) -> tuple[Array, Array] | None:
 
 
 def _fisheye(size: tuple[int, int], images: list[ImagePoints], K: Array) -> tuple[float, Camera]:
-    """Squared errors (px^2), and the equidistant lens near ``K`` (3,3) that leaves them.
+    """Return squared errors (px^2), and the equidistant lens near ``K`` (3,3) with them.
 
     OpenCV's own asks for boards that are flat, one to an image.
 
@@ -199,7 +199,7 @@ def _fisheye(size: tuple[int, int], images: list[ImagePoints], K: Array) -> tupl
 
 
 def _equidistant(size: tuple[int, int], numbers: Array) -> Camera:
-    """The lens of focal lengths, centre and distortion (8)."""
+    """Return the lens of focal lengths, centre and distortion (8)."""
     K = np.array([[numbers[0], 0.0, numbers[2]], [0.0, numbers[1], numbers[3]], [0.0, 0.0, 1.0]])
     return Camera(*size, K=K, D=numbers[4:], distortion_model=DistortionModel.EQUIDISTANT)
 
@@ -210,7 +210,7 @@ def _calibrated(
     candidate: _Candidate,
     start: Array | None = None,
 ) -> Camera | None:
-    """The best lens of this kind, from ``start`` (3,3) or anywhere; None: none fits."""
+    """Return the best lens of this kind, from ``start`` (3,3) or anywhere; None if none fits."""
     points = [np.asarray(image.points, np.float32)[:, None] for image in images]
     pixels = [np.asarray(image.pixels, np.float32)[:, None] for image in images]
     best: tuple[float, Any, Any] | None = None
@@ -240,7 +240,7 @@ def _calibrated(
 
 
 def _folds(lens: Camera) -> bool:
-    """True where pixels of the image have no ray.
+    """Return True if pixels of the image have no ray.
 
     A series that fits the middle of the image, where the board was shown, may turn back towards the
     rim.
@@ -252,7 +252,7 @@ def _folds(lens: Camera) -> bool:
 
 
 def _cancels(lens: Camera, images: list[ImagePoints]) -> bool:
-    """True where numbers beyond any lens's make up for each other, which nothing holds there.
+    """Return True if numbers beyond any lens's compensate each other where nothing holds them.
 
     Under the prior of lenses they cost more than all that the points can tell.
     """
@@ -263,7 +263,7 @@ def _cancels(lens: Camera, images: list[ImagePoints]) -> bool:
 
 
 def _slow(images: list[ImagePoints]) -> list[ImagePoints]:
-    """Images that show much of the map and in which it hardly moves, from all of the recording."""
+    """Return images, from all of the recording, that show much of the map and hardly move."""
     fullest = max((len(image.points) for image in images), default=0)
     least = max(_LEAST_SHARE * fullest, _LEAST_POINTS)
     full = [image for image in images if len(image.points) >= least]
@@ -277,7 +277,7 @@ def _slow(images: list[ImagePoints]) -> list[ImagePoints]:
 
 
 def _speed(before: ImagePoints, after: ImagePoints) -> float:
-    """px per s, of what both images show."""
+    """Return the speed (px/s) of what both images show."""
     common = (before.points[:, None] == after.points[None]).all(axis=2)
     first, second = np.nonzero(common)
     if len(first) == 0:

@@ -54,7 +54,7 @@ class NoMount(ValueError):
 
 
 def first_mount(samples: GyroSamples, spline: Spline, given: Array | None = None) -> GyroMount:
-    """Delay, rotation and bias under which the gyroscope agrees best with the camera's turns.
+    """Return delay, rotation and bias under which the gyroscope best follows the camera.
 
     Args:
         given: (3,3) camera_from_imu, as far as the motion does not tell it.
@@ -94,7 +94,7 @@ class _Match:
 
 
 def _match(samples: GyroSamples, spline: Spline, delay: float, given: Array | None) -> _Match:
-    """The best rotation (Kabsch) and bias at a delay."""
+    """Return the best rotation (Kabsch) and bias at a delay."""
     inside = samples.covered(spline.layout, delay, 0.0)
     if np.count_nonzero(inside) < _LEAST_GUESS:
         return _Match(GyroMount(np.eye(3), np.zeros(3), delay), -np.inf, 1.0)
@@ -118,7 +118,7 @@ def _match(samples: GyroSamples, spline: Spline, delay: float, given: Array | No
 
 
 def gyro_samples(recording: ImuRecording, start_ns: int) -> GyroSamples:
-    """Its finite samples in the order of time, one for each stamp, from a time 0 on."""
+    """Return finite samples in the order of time, one for each stamp, from a time 0 on."""
     finite = np.isfinite(recording.angular_velocities).all(axis=1)
     stamps, order = np.unique(recording.stamps_ns[finite], return_index=True)
     times = (stamps - start_ns).astype(float) * 1e-9
@@ -161,7 +161,7 @@ def with_gyro(
     samples: GyroSamples,
     given: Array | None,
 ) -> tuple[SplineKeypoints, Fit]:
-    """The motion again, with a gyroscope and its mount in it.
+    """Fit the motion again, with a gyroscope and its mount in it.
 
     Args:
         observations: keypoints.
@@ -197,7 +197,7 @@ def with_gyro(
 def _settled(
     camera: Camera, observations: SplineKeypoints, samples: GyroSamples, fitted: Fit
 ) -> tuple[GyroSamples, Fit]:
-    """The joint estimate when the noise of the gyroscope does not change any more."""
+    """Return the joint estimate when the noise of the gyroscope no longer changes."""
     samples = _with_noise(samples, fitted)
     for _ in range(_ROUNDS):
         joint = replace(observations, gyro=samples)
@@ -214,7 +214,7 @@ def _with_noise(samples: GyroSamples, fitted: Fit) -> GyroSamples:
 
 
 def _worth_it(quieter: GyroSamples, finer: Fit, samples: GyroSamples, coarser: Fit) -> bool:
-    """True where finer knots explain more than they cost, by the likelihood of both noises."""
+    """Return True if finer knots explain more than they cost, by both likelihoods."""
     count = np.count_nonzero(quieter.covered(finer.state.spline.layout, 0.0, 0.0))
     gain = 6.0 * count * np.log(samples.deviation / quieter.deviation)
     gain += 4.0 * np.count_nonzero(coarser.inliers) * np.log(coarser.deviation / finer.deviation)
@@ -223,7 +223,7 @@ def _worth_it(quieter: GyroSamples, finer: Fit, samples: GyroSamples, coarser: F
 
 
 def mount_of(camera: Camera, fitted: Fit, samples: GyroSamples, inflation: float) -> MountFound:
-    """Findings of a joint estimate on the IMU.
+    """Return the findings of a joint estimate on the IMU.
 
     Args:
         camera: whose images were stamped when their first row was exposed.
@@ -252,7 +252,7 @@ def mount_of(camera: Camera, fitted: Fit, samples: GyroSamples, inflation: float
 
 
 def middle_row(camera: Camera, readout_time: float) -> float:
-    """How much later than the first row the middle one is exposed, by (signed) readout time."""
+    """Return the time from the first to the middle row's exposure, by (signed) readout time."""
     if readout_time >= 0.0:
         return -camera.first_row_time
     reversed_ = replace(camera, scan_direction=REVERSED[ScanDirection(camera.scan_direction)])

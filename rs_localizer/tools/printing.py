@@ -51,7 +51,7 @@ def largest_side(page: str, across: float, down: float) -> float:
 
 
 def plan(marker_map: MarkerMap, page: str = "a4") -> list[Page]:
-    """A page for a board or a wall of markers, or one for each marker where they do not fit.
+    """Return a page for a board or a wall of markers, or one per marker if they do not fit.
 
     Args:
         marker_map: what is printed: one board, or markers in one plane that face the same way.
@@ -83,7 +83,7 @@ def plan(marker_map: MarkerMap, page: str = "a4") -> list[Page]:
 
 
 def _page(black: Array, page: str, text: str, pose: Pose) -> Page:
-    """The rectangles in the middle of a sheet."""
+    """Return a page with the rectangles in its middle."""
     paper = _paper(black, page)
     low, high = black[:, :2].min(axis=0), (black[:, :2] + black[:, 2:]).max(axis=0)
     if paper is None:
@@ -103,7 +103,7 @@ def _page(black: Array, page: str, text: str, pose: Pose) -> Page:
 
 
 def _paper(black: Array, page: str) -> tuple[float, float] | None:
-    """The page, upright or on its side, on which rectangles fit."""
+    """Return the page, upright or on its side, on which rectangles fit."""
     size = (black[:, :2] + black[:, 2:]).max(axis=0) - black[:, :2].min(axis=0)
     for width, height in (PAGES[page], PAGES[page][::-1]):
         if np.all(size <= np.array(_room(width, height)) + 1e-9):
@@ -117,14 +117,14 @@ def _room(width: float, height: float) -> tuple[float, float]:
 
 
 def _marker(marker: Marker) -> Array:
-    """Rectangles around the middle of a marker."""
+    """Return the rectangles around the middle of a marker."""
     side = marker.size * _MM
     black = _rectangles(pattern(marker.family, marker.id), side / marker.family.cells)
     return np.asarray(black - np.array([0.5 * side, 0.5 * side, 0.0, 0.0]), np.float64)
 
 
 def _board(board: Board) -> tuple[Array, str]:
-    """Rectangles of a board, and what it is."""
+    """Return the rectangles of a board, and its description."""
     square, label = board.square * _MM, f"{board.name}, squares {board.square * _MM:g} mm"
     if isinstance(board, Chessboard):
         places = np.indices((board.rows + 1, board.columns + 1)).sum(axis=0)
@@ -141,7 +141,7 @@ def _board(board: Board) -> tuple[Array, str]:
 
 
 def _rectangles(white: NDArray[np.bool_], cell: float) -> Array:
-    """The black cells as rectangles (n,4), as few as runs along the rows make them."""
+    """Return the black cells as rectangles (n,4), as few as runs along the rows make them."""
     rectangles = []
     for row, cells in enumerate(white[::-1]):
         edges = np.flatnonzero(np.diff(np.concatenate([[True], cells, [True]]).astype(int)))
@@ -151,7 +151,7 @@ def _rectangles(white: NDArray[np.bool_], cell: float) -> Array:
 
 
 def page_files(path: Path, count: int) -> list[Path]:
-    """Files of so many pages: one PDF, or a PNG for each.
+    """Return the files of so many pages: one PDF, or a PNG for each.
 
     Raises:
         PrintError: for another ending.

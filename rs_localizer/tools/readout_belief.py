@@ -36,7 +36,7 @@ class Stamps:
 
 
 def examine(times: Array) -> Stamps:
-    """Even intervals nearest to the stamps (f,), s, sorted.
+    """Return the even intervals nearest to the stamps (f,), s, sorted.
 
     The number of intervals is counted from stamp to stamp, so that images may be missing.
     """
@@ -72,7 +72,7 @@ _DISAGREEMENT = 0.01
 
 
 def disagreement(values: Array, deviations: Array) -> float:
-    """Factor by which deviations (b,) are too small (Birge's ratio), at least 1."""
+    """Return the factor by which deviations (b,) are too small (Birge's ratio), at least 1."""
     if len(values) < 2:
         return 1.0
     weights = deviations**-2.0
@@ -88,7 +88,7 @@ def disagreement(values: Array, deviations: Array) -> float:
 
 
 def discrepancy(value: float, values: Array, deviations: Array) -> float:
-    """Difference of the whole's value from the mean of its parts (b,), beyond its noise.
+    """Return the difference of the whole from the mean of its parts (b,), beyond noise.
 
     Corners that are off in all images of a part alike bend its lens and shape. The shorter it is,
     the more of the shutter is taken for those: then the whole lies beside all of its parts.
@@ -246,7 +246,7 @@ class Evidence:
 
 
 def apart_of(halves: tuple[Block, ...]) -> tuple[float, float]:
-    """Difference of the readout times of two halves, and its deviation (s)."""
+    """Return the difference of the readout times of two halves, and its deviation (s)."""
     if len(halves) < 2:
         return 0.0, math.inf
     one, other = halves

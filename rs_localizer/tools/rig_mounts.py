@@ -92,7 +92,7 @@ class Mounted:
 
 
 def calibrate_rig(recordings: Mapping[str, Recording]) -> dict[str, Mounted]:
-    """Extrinsics and clock offsets of the cameras of a rig, in the axes and clock of the first.
+    """Estimate extrinsics and clock offsets of a rig, by axes and clock of the first camera.
 
     Raises:
         ValueError: for a single camera, or when the motions of two cameras are not one, or do not
@@ -135,13 +135,13 @@ def calibrate_rig(recordings: Mapping[str, Recording]) -> dict[str, Mounted]:
 
 
 def _freedom(first: CameraCalibration, own: CameraCalibration) -> Freedom:
-    """Freedom of a camera's own calibration, with the accelerations of the rig."""
+    """Return the freedom of a camera's own calibration, with the accelerations of the rig."""
     names = ("lens", "lens_deviations", "landmarks", "paper", "stamps")
     return replace(first.fit.freedom, **{name: getattr(own.fit.freedom, name) for name in names})
 
 
 def first_extrinsics(rig: Spline, own: Spline, shift: float) -> Extrinsics:
-    """A first guess, from the motions of the rig and of the camera alone through one map.
+    """Return a first guess from the motions of rig and camera through one map.
 
     Args:
         shift: s, to add to the times of ``own`` for the stamps that the offset is to be added to.
@@ -187,7 +187,7 @@ def _turning(spline: Spline) -> tuple[float, Array, Array]:
 
 
 def _at_offset(rig: Spline, own: Spline, offset: float) -> tuple[Extrinsics, float]:
-    """Extrinsics at a later time of the rig (s), and how far (rad) the axes turn about them."""
+    """Return extrinsics at a later time of the rig (s), and the spread (rad) of the axes."""
     times = np.arange(own.layout.starts[0], own.layout.ends[-1], _STEP)
     times = times[own.layout.inside(times) & rig.layout.inside(times + offset)]
     body, camera = rig.states(times + offset), own.states(times)
@@ -204,7 +204,7 @@ class _Joint(NamedTuple):
 
     @classmethod
     def of(cls, problem: Problem, start: Unknowns) -> _Joint:
-        """The estimate; with errors of a second taken together, unless images have own times."""
+        """Return the estimate; errors of a second are taken together, unless times are free."""
         found = solve(problem, start)
         if any(camera.freedom.stamps > 0.0 for camera in problem.views):
             return cls(problem, found)
@@ -216,7 +216,7 @@ class _Joint(NamedTuple):
         return self.fit.state, *self.fit.state.others
 
     def numbers(self, place: int, about: Extrinsics) -> tuple[Array, Array]:
-        """Turn, displacement and stamps' offset by some extrinsics; their deviations (7,)."""
+        """Return rotation, displacement and clock offset about extrinsics, and deviations (7,)."""
         if place == 0:
             return np.zeros(EXTRINSICS), np.zeros(EXTRINSICS)
         problem, camera = self.problem, self.problem.views[place].camera
@@ -234,7 +234,7 @@ class _Joint(NamedTuple):
 
 
 def _parts(whole: _Joint) -> Iterator[_Joint]:
-    """Equal parts of the recording, each with all numbers of its own."""
+    """Yield equal parts of the recording, each with all numbers of its own."""
     layout = whole.fit.state.spline.layout
     for start, end in pairwise(np.linspace(layout.starts[0], layout.ends[-1], _PARTS + 1)):
         state = cut(whole.fit.state, start, end)

@@ -52,7 +52,7 @@ def smooth_frames(
     stamps_ns: list[int],
     rate: float | None,
 ) -> Iterator[SmoothedFrames]:
-    """The frames of a recording again, each with the motion that all of them say, by windows.
+    """Yield the frames of a recording again, with their common motion, by windows.
 
     A window is smoothed when the last image of it has come, and forgotten, so that the memory that
     this takes does not grow with the recording.
@@ -111,7 +111,7 @@ def smooth_frames(
 
 
 def _windows(stamps_ns: IntArray) -> Iterator[_Window]:
-    """Those that hold images; the last one takes a rest of less than half a window."""
+    """Yield windows that hold images; the last one takes a rest of less than half a window."""
     if not len(stamps_ns):
         return
     order = np.argsort(stamps_ns, kind="stable")
@@ -132,7 +132,7 @@ def _windows(stamps_ns: IntArray) -> Iterator[_Window]:
 
 
 def _moments(stamps_ns: IntArray, first_ns: int, last_ns: int | None, rate: float) -> IntArray:
-    """Evenly sampled moments of a window, counted from the first image of the recording.
+    """Return even moments of a window, counted from the first image of the recording.
 
     Args:
         stamps_ns: (m,) of the images in the window.
@@ -150,7 +150,7 @@ def _moments(stamps_ns: IntArray, first_ns: int, last_ns: int | None, rate: floa
 def _smoothed(
     localizer: FrameLocalizer, frames: list[Localized], inputs: IntArray, sampled_evenly: bool
 ) -> SmoothedFrames:
-    """Frames at the stamps ``inputs`` (m,) by the motion through ``frames``."""
+    """Return frames at the stamps ``inputs`` (m,) by the motion through ``frames``."""
     motion, moments = _motion(localizer, frames, inputs)
     sampled = motion.sample(moments)
     once = {} if sampled_evenly else {frame.input_stamp_ns: frame for frame in frames}
@@ -195,7 +195,7 @@ def _smoothed(
 def _motion(
     localizer: FrameLocalizer, frames: list[Localized], inputs: IntArray
 ) -> tuple[Smoothed, IntArray]:
-    """The motion through frames, and the moments (m,) ns that are published of inputs (m,)."""
+    """Return the motion through frames, and the moments (m,) ns published of inputs (m,)."""
     config, calibration = localizer.config, localizer.calibration
     if isinstance(localizer, RigFrames):
         rig, posed = localizer.rig, [_rig_frame(frame) for frame in frames]

@@ -45,7 +45,7 @@ _NUMBERS, _USUAL = 6.0, np.array([2.0, 1.0])
 
 
 def squares_and_numbers(fitted: Fit) -> tuple[Array, Array]:
-    """Evidence of an estimate on the accelerations that were expected of it, angular and linear.
+    """Return evidence on the expected accelerations, angular and linear.
 
     Returns:
         their sums of squares (2,), (rad/s^2)^2 and (m/s^2)^2, and how many numbers (2,) the
@@ -108,7 +108,7 @@ class Smoothed:
     shaken: BoolArray
 
     def sample(self, stamps_ns: IntArray) -> Sampled:
-        """The camera's motion at times (m,) in ns."""
+        """Return the camera's motion at times (m,) in ns."""
         times = np.array([(int(stamp) - self.start_ns) * 1e-9 for stamp in stamps_ns])
         spline = self.fit.state.spline
         covariances = self._in_camera(times)
@@ -121,18 +121,18 @@ class Smoothed:
         )
 
     def _beside_shaken(self, times: Array) -> BoolArray:
-        """Times (m,) before or after which the image is shaken."""
+        """Return a mask of times (m,) beside an image that vibrates."""
         after = np.clip(np.searchsorted(self.times, times), 0, len(self.times) - 1)
         before = np.maximum(np.searchsorted(self.times, times, side="right") - 1, 0)
         return self.shaken[before] | self.shaken[after]
 
     def _apart(self, times: Array) -> Array:
-        """How far apart (m,) the images before and after these times are, s."""
+        """Return the interval (m,) between the images around these times, s."""
         after = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
         return self.times[after] - self.times[after - 1]
 
     def _in_camera(self, times: Array) -> Array:
-        """Covariances (m,12,12) in the order and the axes of ``Estimate.covariance``, SI."""
+        """Return covariances (m,12,12) in order and axes of ``Estimate.covariance``, SI."""
         states = self.fit.state.spline.states(times)
         back = np.swapaxes(states.rotations, 1, 2)
         velocities = np.einsum("nij,nj->ni", back, states.linear)
@@ -172,7 +172,7 @@ class Smoothed:
 
 
 def _deviations(covariances: Array) -> Array:
-    """Standard deviations (m,2) of orientation and position."""
+    """Return standard deviations (m,2) of orientation and position."""
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     sums = np.column_stack([variances[:, :3].sum(axis=1), variances[:, 3:6].sum(axis=1)])
     deviations: Array = np.sqrt(sums)
@@ -189,7 +189,7 @@ class PosedFrame:
 
 
 def smooth(rig: Rig, frames: list[PosedFrame]) -> Smoothed:
-    """The motion of a rig, or of a camera alone, through frames in their order.
+    """Return the motion of a rig, or of a single camera, through frames in their order.
 
     Args:
         rig: with the readout times of its cameras.
@@ -221,7 +221,7 @@ def smooth(rig: Rig, frames: list[PosedFrame]) -> Smoothed:
 
 
 def _parts(rig: Rig, frames: list[PosedFrame], start_ns: int) -> tuple[Parts, list[Extrinsics]]:
-    """The cameras that saw something, with their keypoints and mounts."""
+    """Return the cameras that saw something, with their keypoints and mounts."""
     parts: Parts = []
     mounted: list[Extrinsics] = []
     for name, camera in rig.cameras.items():
@@ -244,7 +244,7 @@ def _parts(rig: Rig, frames: list[PosedFrame], start_ns: int) -> tuple[Parts, li
 
 
 def _knots(times: Array) -> tuple[float, float]:
-    """Spacing of the knots, and time in which accelerations fade (0: never), s, of times (f,)."""
+    """Return the spacing of knots, and the fading of accelerations (0: never), s."""
     interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     fading = _FADING if interval < 0.5 * _FADING else 0.0
     return min(_NARROW_SPACING if fading else LONGEST_SPACING, interval), fading
@@ -255,7 +255,7 @@ def _problem(parts: Parts, state: Unknowns, freedom: Freedom) -> Problem:
 
 
 def _best(parts: Parts, start: Unknowns, fading: float) -> Fit:
-    """With the accelerations that the motion shows, and finer knots if they are worth it."""
+    """Fit with the accelerations that the motion shows, and finer knots if worth it."""
     freedom = Freedom(readout_time=False, fading=fading)
     fitted = _lively(parts, solve(_problem(parts, start, freedom), start))
     spline = fitted.state.spline
@@ -267,7 +267,7 @@ def _best(parts: Parts, start: Unknowns, fading: float) -> Fit:
 
 
 def _shaken(fitted: Fit, parts: Parts, focal_length: float, estimates: list[Estimate]) -> BoolArray:
-    """Which images (f,) shake in a way that the motion does not follow, by their keypoints."""
+    """Return a mask (f,) of images with vibration that the motion does not follow."""
     frames = np.concatenate([seen.frames for _, seen in parts])
     own = np.array([max(one.residual_rms, fitted.freedom.least_noise) ** 2 for one in estimates])
     count = np.bincount(frames, minlength=len(estimates))
@@ -284,7 +284,7 @@ def _shaken(fitted: Fit, parts: Parts, focal_length: float, estimates: list[Esti
 
 
 def _turns_in_frame(focal_length: float, estimates: list[Estimate]) -> BoolArray:
-    """Which images (f,) turn within their exposure in a way that knots follow only in part."""
+    """Return a mask (f,) of images whose in-frame rotation knots follow only in part."""
     turns = [
         shake_at(_ROWS, one.shake)[:, :3] if len(one.shake) else np.zeros(3) for one in estimates
     ]
@@ -296,7 +296,7 @@ def _turns_in_frame(focal_length: float, estimates: list[Estimate]) -> BoolArray
 
 
 def _lively(parts: Parts, fitted: Fit) -> Fit:
-    """With a prior of the accelerations that the motion itself shows.
+    """Add a prior of the accelerations that the motion itself shows.
 
     Each round is a step nearer to the greatest marginal likelihood.
     """

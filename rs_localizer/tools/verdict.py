@@ -36,18 +36,18 @@ _LEAST_SCALE = 0.005
 
 
 def readout_time(result: CameraCalibration) -> float:
-    """The readout time (s) to be set: 0 for a global shutter."""
+    """Return the readout time (s) to be set: 0 for a global shutter."""
     return 0.0 if result.global_shutter else abs(result.readout_time)
 
 
 def scan_direction(result: CameraCalibration) -> ScanDirection:
-    """The direction that the sign of the readout time says."""
+    """Return the direction that the sign of the readout time means."""
     given = ScanDirection(result.fit.camera.scan_direction)
     return given if result.global_shutter or result.readout_time > 0.0 else REVERSED[given]
 
 
 def lens_refusal(result: CameraCalibration) -> str:
-    """One line with the figure when the recording determines no lens; or ''."""
+    """Return one line with the figure if the recording determines no lens; or ''."""
     camera = result.fit.camera
     if np.all((camera.K[:2, 2] > 0.0) & (camera.K[:2, 2] < camera.size)):
         return ""
@@ -58,17 +58,17 @@ def lens_refusal(result: CameraCalibration) -> str:
 
 
 def refusal(result: CameraCalibration) -> str:
-    """One line with the figure when lens or readout time is not determined; or ''."""
+    """Return one line with the figure if lens or readout time is not determined; or ''."""
     return lens_refusal(result) or result.disbelief
 
 
 def shape_is_free(result: CameraCalibration) -> bool:
-    """True where the map's shape was estimated."""
+    """Return True if the map's shape was estimated."""
     return result.fit.freedom.landmarks > 0.0
 
 
 def moved(result: CameraCalibration, points: Array) -> Array:
-    """Points (n,3) of the map where they were found; those that no image shows stay."""
+    """Return points (n,3) of the map where they were found; unseen ones stay."""
     rows = {tuple(place): row for row, place in enumerate(result.posed.observations.landmarks)}
     places = [rows.get(tuple(point)) for point in points]
     return np.array([
@@ -78,7 +78,7 @@ def moved(result: CameraCalibration, points: Array) -> Array:
 
 
 def remarks(result: CameraCalibration) -> list[str]:
-    """Sentences on what is odd, and on what the value is worth."""
+    """Return sentences on oddities, and on the worth of the value."""
     said = []
     if result.global_shutter:
         said.append(
@@ -117,7 +117,7 @@ def remarks(result: CameraCalibration) -> list[str]:
 
 
 def uncovered(result: CameraCalibration) -> list[str]:
-    """How much of the image no keypoint covers, and where that is; empty: hardly any."""
+    """Say how much of the image no keypoint covers, and where; empty: hardly any."""
     observations, camera = result.posed.observations, result.fit.camera
     pixels = observations.pixels[observations.trusted]
     cells = (pixels / camera.size * _CELLS * 3).astype(int).clip(0, 3 * _CELLS - 1)
@@ -165,7 +165,7 @@ def table(found: CameraCalibration, rate: float | None) -> Iterator[str]:
 
 
 def of_lens(found: CameraCalibration) -> Iterator[str]:
-    """The lens with its deviations."""
+    """Yield rows of the lens with its deviations."""
     state = found.fit.state
     deviations = np.sqrt(np.diag(found.fit.border_covariance)[1 : 1 + len(state.lens)])
     names = ["fx", "fy", "cx", "cy", *(f"D[{k}]" for k in range(len(state.lens) - 4))]
@@ -198,7 +198,7 @@ def _straightness(found: CameraCalibration) -> str:
 
 
 def of_imu(found: CameraCalibration, imu: ImuRecording, stamp_offset: float) -> Iterator[str]:
-    """Rows of the table, and sentences on what is odd."""
+    """Yield rows of the table, and sentences on oddities."""
     one = found.mount
     if one is None:
         yield f"imu: {found.no_mount}"
@@ -238,5 +238,5 @@ def of_imu(found: CameraCalibration, imu: ImuRecording, stamp_offset: float) -> 
 
 
 def numbers(values: Array, digits: int) -> str:
-    """Values (n,) beside each other."""
+    """Join values (n,) beside each other."""
     return " ".join(f"{value:.{digits}f}" for value in values)

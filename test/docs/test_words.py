@@ -30,18 +30,18 @@ VERBS = frozenset(
     Accept Add Adjust Answer Append Apply Ask Begin Bound Build Calibrate Call Carry Change
     Check Choose Clear Collect Combine Compare Compile Complete Compress Compute Configure
     Convert Copy Correct Count Create Decide Declare Decode Delay Delete Derive Describe Detach
-    Detect Divide Draw Drop Emit Encode End Ensure Enter Estimate Evaluate Execute Expand Expect
-    Explain Extend Extract Feed Fill Filter Find Finish Fit Follow Forget Format Gather Give
-    Group Handle Hold Ignore Import Initialize Insert Integrate Interpolate Interpret Invert
-    Iterate Join Judge Keep Know Learn Leave Let Limit Linearize List Listen Load Localize Lock
-    Log Look Lower Make Map Mark Match Measure Merge Minimize Move Multiply Name Note Open
-    Optimize Order Pack Parse Place Plan Plot Pop Predict Prepare Print Process Project
-    Propagate Publish Put Raise Ransac Read Receive Record Reduce Refine Reflect Refuse Register
-    Remember Remove Render Repeat Replace Replay Report Request Reset Resolve Restart Restore
-    Return Rotate Round Run Sample Save Say Scale Score Search Select Send Set Shift Show Shut
-    Simulate Skip Smooth Solve Sort Split Start State Step Stop Store Sum Survey Swap Take Tell
-    Test Trace Track Transform Triangularize Triangulate Try Turn Undo Unpack Update Use
-    Validate Wait Walk Warn Weigh Widen Write Yield
+    Detect Divide Do Draw Drop Emit Encode End Ensure Enter Estimate Evaluate Execute Expand
+    Expect Explain Extend Extract Feed Fill Filter Find Finish Fit Follow Forget Format Gather
+    Give Group Handle Hold Ignore Import Initialize Insert Integrate Interpolate Interpret
+    Invert Iterate Join Judge Keep Know Learn Leave Let Limit Linearize List Listen Load
+    Localize Lock Log Look Lower Make Map Mark Match Measure Merge Minimize Move Multiply Name
+    Note Number Open Optimize Order Pack Parse Place Plan Plot Pop Predict Prepare Print Process
+    Project Propagate Publish Put Queue Raise Ransac Read Receive Reconstruct Record Reduce
+    Refine Reflect Refuse Register Remember Remove Render Repeat Replace Replay Report Request
+    Reset Resolve Restart Restore Return Rotate Round Run Sample Save Say Scale Score Search
+    Select Send Set Shift Show Shut Simulate Skip Smooth Solve Sort Split Start State Step Stop
+    Store Sum Survey Swap Take Tell Test Thin Trace Track Transform Triangularize Triangulate
+    Try Turn Undo Unpack Update Use Validate Wait Walk Warn Weigh Widen Write Yield
     """.split()
 )
 DOCUMENTED = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef

@@ -17,7 +17,7 @@ from rs_localizer.settings import FEATURES_NAME
 
 
 def tell(extracted: Extracted) -> tuple[int, Told]:
-    """Stamp of an image (ns), and what the statistics keep of it."""
+    """Return the stamp of an image (ns), and what the statistics keep of it."""
     count = len(extracted.features)
     text = f"{count or 'no'} keypoints in the last image"
     return extracted.image.stamp_ns, Told(State.DETECTING, text, {"Keypoints": str(count)})

@@ -42,7 +42,7 @@ Picture = NDArray[np.uint8]  # (h,w,3) blue, green, red
 
 
 def judge(summary: Summary, silence: Mapping[str, Silence], oddities: Mapping[str, str]) -> Health:
-    """Diagnosis of an active node with listeners: ``waiting for images`` or ``detecting``."""
+    """Return the health of an active node with listeners: ``waiting for images``, ``detecting``."""
     causes = [f"{item.topic}: {item.cause}" for item in silence.values() if item.cause]
     if causes or not silence:
         message = "; ".join([f"{State.WAITING} images", *causes])
@@ -92,7 +92,7 @@ class ImageNode(ManagedNode[Settings, Result], Generic[Settings, Result]):
     # -- what a node looks for ---------------------------------------------------------------
 
     def make_finder(self, config: Settings) -> Any:
-        """The finder that looks at images, of the class that works offline, too.
+        """Make the finder that looks at images; it works offline, too.
 
         Raises:
             ValueError: for settings that cannot be used.
@@ -100,15 +100,15 @@ class ImageNode(ManagedNode[Settings, Result], Generic[Settings, Result]):
         raise NotImplementedError
 
     def make_cloud(self, result: Result, make: Make) -> Any:
-        """The sensor_msgs/PointCloud2 of an image."""
+        """Make the sensor_msgs/PointCloud2 of an image."""
         raise NotImplementedError
 
     def draw(self, result: Result) -> tuple[Image, Picture]:
-        """An image and its debug picture, in the worker's thread."""
+        """Draw an image and its debug picture, in the worker's thread."""
         raise NotImplementedError
 
     def describe(self, finder: Any) -> str:
-        """Words for the log on what the node looks for."""
+        """Describe for the log what the node looks for."""
         raise NotImplementedError
 
     # -- as every managed node ---------------------------------------------------------------
@@ -188,7 +188,7 @@ class ImageNode(ManagedNode[Settings, Result], Generic[Settings, Result]):
         self._listening = wanted
 
     def _image_topic(self) -> str:
-        """The topic of the images; where none has a publisher, the one so far."""
+        """Return the topic of the images; if none has a publisher, the one so far."""
         transport = self.config.transport
         if transport != ImageTransport.AUTO:
             return IMAGE if transport == ImageTransport.RAW else COMPRESSED_IMAGE

@@ -21,7 +21,7 @@ from rs_localizer.settings import DETECTOR_NAME
 
 
 def tell(detected: Detected) -> tuple[int, Told]:
-    """Stamp of an image (ns), and what the statistics keep of it."""
+    """Return the stamp of an image (ns), and what the statistics keep of it."""
     detections = detected.detections
     markers = sum(int(item.mapped.sum()) for item in detections.markers)
     boards, corners = len(detections.boards), len(detections.ids)

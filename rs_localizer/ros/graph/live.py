@@ -121,14 +121,14 @@ class LiveNode:
         return self._process.pid
 
     def publisher(self, kind: type, topic: str) -> Any:
-        """A publisher on another of the node's inputs, made when it is first asked for."""
+        """Return a publisher on another of the node's inputs, made on first use."""
         if topic not in self._others:
             name = f"{self.namespace}/{topic}"
             self._others[topic] = self._node.create_publisher(kind, name, _MANY)
         return self._others[topic]
 
     def wait(self, tell: Callable[[str], object]) -> None:
-        """Until the node is active and heard; ``tell`` is told its last line meanwhile.
+        """Wait until the node is active and heard; ``tell`` gets its last line meanwhile.
 
         Raises:
             LiveError: when it died or fell silent, with the last lines of its log.
@@ -155,7 +155,7 @@ class LiveNode:
         to_cloud.publish(copy_message(cloud, "sensor_msgs/msg/PointCloud2"))
 
     def localize(self, info: Any, cloud: Any) -> PoseStamped | None:
-        """The node's answer to a frame; None: it has refused it.
+        """Return the node's answer to a frame; None if the node has refused it.
 
         Raises:
             LiveError: as :meth:`wait`.

@@ -38,14 +38,15 @@ _RESTART = 500_000_000
 
 
 class Broadcaster:
-    """Sends what ``publish_tf`` wants.
+    """Sends the transform that ``publish_tf`` asks for.
 
-    ``map_to_odom`` never stops: what :func:`.decide` holds is sent ``tf_rate`` times a second, as
-    long as odometry comes, stamped ``transform_tolerance`` ahead of it, so that whoever asks for a
-    time that odometry knows has an answer. How sure it is goes to ``~/map_to_odom``.
+    ``map_to_odom`` never stops. As long as odometry comes, the transform that :func:`.decide` holds
+    is sent ``tf_rate`` times a second. It is stamped ``transform_tolerance`` ahead of the odometry,
+    so that every lookup at a time that odometry knows succeeds. Its covariance goes to
+    ``~/map_to_odom``.
 
-    :meth:`publish` and :meth:`give` may be called from any thread, all else belongs to the
-    executor's.
+    :meth:`publish` and :meth:`give` may be called from any thread, all other methods only from the
+    thread of the executor.
 
     Args:
         node: sends, and listens for the odometry.
@@ -75,7 +76,7 @@ class Broadcaster:
         self._failed: tuple[float, str] | None = None
 
     def configure(self, config: NodeConfig) -> None:
-        """Have what these settings need.
+        """Create what these settings need.
 
         Raises:
             ValueError: without tf2_ros; for a file that holds no pose.
@@ -108,7 +109,7 @@ class Broadcaster:
             self._failed, self._answer = None, ""
 
     def jumped(self, seconds: float) -> None:
-        """Time has jumped: what odometry said before is of another drive."""
+        """Forget odometry after a jump of time: it was of another drive."""
         self.tf.clear()
         self.forget()
         self._refusals.notice(
@@ -120,7 +121,7 @@ class Broadcaster:
         self._state, self._decision = CorrectionState(drift=self._state.drift), None
 
     def fault(self) -> dict[str, str]:
-        """For the diagnostics: why nothing has been sent lately, if something should have been."""
+        """Say for the diagnostics why nothing has been sent lately that should have been."""
         failed, since = self._failed, time.monotonic() - WINDOW
         missing = failed is not None and failed[0] >= since and self._sent < since
         found = {Notice.NOT_BROADCAST: failed[1]} if failed and missing else {}
@@ -248,7 +249,7 @@ class Broadcaster:
         return text + late
 
     def _begin(self, seen: FoundPose, config: NodeConfig) -> Decision:
-        """Decide, and send what is the first at once."""
+        """Decide, and send the first transform at once."""
         first = self._state.held is None
         decision = self._decide(seen, config)
         if first:  # nobody shall have to wait for the time that it is stamped ahead

@@ -36,7 +36,7 @@ DEVIATION = "Position deviation (cm)"
 
 
 def tell(frame: Localized) -> tuple[int, Told]:
-    """The stamp of the input (ns), and what is told."""
+    """Return the stamp of the input (ns), and what the statistics keep of it."""
     estimate = frame.estimate
     residuals = estimate.residuals[estimate.inliers]
     points, inliers = len(estimate.inliers), len(residuals)
@@ -63,7 +63,7 @@ def tell(frame: Localized) -> tuple[int, Told]:
 
 
 def integrity_message(frame: Localized) -> DiagnosticArray:
-    """The probability that a pose lies outside its region, with the pose's stamp."""
+    """Return the probability that a pose lies outside its region, with its stamp."""
     doubt = frame.estimate.integrity
     status = DiagnosticStatus(
         level=bytes([Level.WARN if doubt > DOUBTFUL else Level.OK]),
@@ -83,7 +83,7 @@ _MOST_TILT = math.radians(10.0)
 
 
 def imu_oddity(state: ImuState | None) -> dict[str, str]:
-    """Reasons of a camera that goes on alone, and what to look at; what contradicts gravity."""
+    """Return reasons why the camera goes on alone, with advice, and what contradicts gravity."""
     if state is None:
         return {}
     oddities = {}
@@ -105,7 +105,7 @@ def imu_oddity(state: ImuState | None) -> dict[str, str]:
 
 
 def readout_values(seen: MeasuredReadout | None) -> dict[str, str]:
-    """The readout time as the camera's motion shows it."""
+    """Return the readout time as the camera's motion shows it."""
     if seen is None:
         return {}
     readout, deviation = 1e3 * seen.readout_time, 1e3 * seen.deviation
@@ -113,7 +113,7 @@ def readout_values(seen: MeasuredReadout | None) -> dict[str, str]:
 
 
 def imu_values(state: ImuState | None) -> dict[str, str]:
-    """Values by readable names; what is not known is left out."""
+    """Return values by readable names, without what is not known."""
     if state is None:
         return {}
     alone = state.mostly if state.share < _FEW else None
@@ -156,7 +156,7 @@ class Condition:
 
 
 def of_interest(silence: Mapping[str, Silence], missing: Sequence[str]) -> dict[str, Silence]:
-    """Without the inputs that nobody publishes and nothing waits for.
+    """Drop the inputs that nobody publishes and nothing waits for.
 
     Frames come as correspondences or as keypoints; only keypoints need a map.
     """
@@ -210,7 +210,7 @@ def _judge(condition: Condition, summary: Summary) -> Health:
 
 
 def _silent_frames(condition: Condition) -> Health | None:
-    """Diagnosis where no frames come; None where they do."""
+    """Return the health if no frames come; None if they do."""
     silences = _of_frames(condition.silence)
     if not silences or any(item.heard and not item.cause for item in silences):
         return None

@@ -137,7 +137,7 @@ class Publisher:
         return bool(self._publishers[name].get_subscription_count())
 
     def _send(self, frame: Localized, names: Collection[str]) -> None:
-        """Publish, of these, what somebody listens to; nothing else is built."""
+        """Publish those of these outputs that have subscribers; nothing else is built."""
         for name, message in each_message(frame, make_message, list(filter(self._wanted, names))):
             self._publishers[name].publish(message)
 
@@ -207,7 +207,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
                 self._tick_at(config.output_rate)
 
     def _tick_at(self, rate: float) -> None:
-        """Have the motion published so many times a second; 0: with the images only."""
+        """Publish the motion at this rate (Hz); 0: with the images only."""
         if self._ticks is not None:
             self.destroy_timer(self._ticks)
             self._ticks = None
@@ -232,7 +232,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
     # -- inputs, in the executor's thread ----------------------------------------------------
 
     def topics(self, config: NodeConfig) -> dict[str, Topic]:
-        """What the node listens to with these settings."""
+        """Return the topics that the node subscribes to with these settings."""
         take = {
             Role.FRAMES: self._take_frame,
             Role.SAMPLES: self._take_sample,
@@ -257,7 +257,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         return found
 
     def _take_frame(self, item: Input, message: Any) -> None:
-        """Have a frame localized, unless a newer one comes first."""
+        """Queue a frame to be localized, unless a newer one comes first."""
         assert self.worker is not None
         self.worker.process(item.topic, message)
 
@@ -297,7 +297,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         self._update(kind, FrameLocalizer.give_pose, given)
 
     def _update(self, kind: str, use: Any, *values: Any) -> None:
-        """Have the worker do this with what localizes the frames, before the next of them."""
+        """Queue a change of the localizer for the worker, before the next frame."""
         assert self.worker is not None
         self.worker.update(kind, functools.partial(use, self._frames, *values))
 
@@ -356,5 +356,5 @@ def _patience(frames: FrameLocalizer, message: Any) -> float:
 
 
 def described(landmarks: Map) -> str:
-    """A map in one line."""
+    """Describe a map in one line."""
     return f"the map has {len(landmarks)} landmarks in frame {landmarks.frame!r}"

@@ -37,7 +37,7 @@ class Rivals:
         """What contradicts for ever, by notice."""
 
     def parent(self, item: Broadcast) -> str:
-        """The parent that others give this child; its own where nobody does."""
+        """Return the parent that others give this child; its own if nobody does."""
         with self._lock:
             return self._parents.get(item.child, (item.parent, ""))[0]
 
@@ -52,7 +52,7 @@ class Rivals:
                 self._sent.popitem(last=False)
 
     def hear(self, message: Any, decision: Decision | None, *, static: bool) -> dict[str, str]:
-        """What is wrong with a TransformStamped that has come, by notice.
+        """Return what is wrong with a TransformStamped that has come, by notice.
 
         Args:
             message: it.
@@ -92,7 +92,7 @@ class Rivals:
         return f"{other}: {_said(theirs)} instead of {_said(ours)}, which moves the body {far(off)}"
 
     def _two_parents(self, parent: str, child: str, static: bool) -> str:
-        """A child that goes to and fro, or that is static below two."""
+        """Describe a child that goes to and fro, or that is static below two parents."""
         last, before = self._parents.setdefault(child, (parent, ""))
         fixed = self._static.get(child, parent)
         if static:
@@ -109,7 +109,7 @@ _PARTS = (slice(0, 3), slice(3, 6))
 
 
 def _offset(ours: Transform, theirs: Transform, decision: Decision) -> Any:
-    """From where our transform has the body to where theirs has it: (6,) m, rad."""
+    """Return the offset (6,) m, rad from our pose of the body to theirs."""
     newest = decision.state.newest
     odom = Transform(np.eye(3), np.zeros(3)) if newest is None else newest.odom_from_body
     here, there = ours @ odom, theirs @ odom

@@ -37,7 +37,7 @@ def check(config: NodeConfig) -> None:
 
 
 def needed(config: NodeConfig) -> str:
-    """The setting that needs TF, and its value; empty if there is none."""
+    """Return the setting that needs TF, and its value; empty if there is none."""
     if config.base_frame:
         return f"base_frame {config.base_frame!r}"
     if config.of_cameras:
@@ -46,7 +46,7 @@ def needed(config: NodeConfig) -> str:
 
 
 def import_tf2_ros(what: str) -> ModuleType:
-    """The package, which ``what`` needs; ``ValueError`` with what to do where it is missing."""
+    """Import the package that ``what`` needs; ``ValueError`` with advice if it is missing."""
     try:
         return importlib.import_module("tf2_ros")
     except ImportError as error:
@@ -117,7 +117,7 @@ class Tf:
         self._undo.close()
 
     def lookup(self, target: str, source: str, stamp_ns: int | None) -> Transform:
-        """``target_from_source`` at a time; None: the latest.
+        """Return ``target_from_source`` at a time (ns); None: the latest.
 
         Raises:
             NotYetError: when it is known for earlier times.
@@ -126,7 +126,7 @@ class Tf:
         return read_transform(self._ask(target, source, stamp_ns).transform)
 
     def moves(self, target: str, source: str) -> bool:
-        """True if a part of the transform comes with a time.
+        """Return True if a part of the transform comes with a time.
 
         Raises:
             TransformError: when it is not known at all.
@@ -134,7 +134,7 @@ class Tf:
         return self.latest(target, source)[0] != 0
 
     def latest(self, target: str, source: str) -> tuple[int, Transform]:
-        """Stamp (ns) of the newest ``target_from_source``, and that; 0: it is static.
+        """Return the stamp (ns) of the newest ``target_from_source``, and it; 0 if it is static.
 
         Raises:
             TransformError: when it is not known at all.
@@ -143,7 +143,7 @@ class Tf:
         return stamp_of(found), read_transform(found.transform)
 
     def _ask(self, target: str, source: str, stamp_ns: int | None) -> Any:
-        """The geometry_msgs/TransformStamped that tf2 has now."""
+        """Ask tf2 for the geometry_msgs/TransformStamped that it has now."""
         buffer = self._buffer
         if buffer is None:
             raise TransformError(self._deaf)
@@ -168,7 +168,7 @@ class Tf:
 
 
 def _listen(tf2_ros: Any, buffer: Any, node: Node, hear: Callable[[list[Any], bool], None]) -> Any:
-    """A tf2_ros.TransformListener that tells of what has come."""
+    """Return a tf2_ros.TransformListener that passes on what has come."""
 
     class Listener(tf2_ros.TransformListener):  # type: ignore[misc]
         def callback(self, data: Any) -> None:

@@ -15,7 +15,7 @@ _SAME_CLOCK = ClockChange.ROS_TIME_NO_CHANGE  # else use_sim_time was set
 
 
 def watch_clock(node: Node, jumped: Callable[[float], None]) -> Any:
-    """Have this called with the seconds of each jump of the node's clock; the handle.
+    """Call this with the seconds of each jump of the node's clock; return the handle.
 
     A simulated clock jumps where a simulation is reset, or another part of a recording is played;
     not with each of its steps, and not when it is set for the first time.

@@ -19,13 +19,13 @@ from rclpy.timer import Timer
 
 @cache
 def message_class(type_name: str) -> Any:
-    """The rclpy class of a type such as ``geometry_msgs/msg/Pose``."""
+    """Return the rclpy class of a type such as ``geometry_msgs/msg/Pose``."""
     package, _, name = type_name.split("/")
     return getattr(importlib.import_module(f"{package}.msg"), name)
 
 
 def installed(*type_names: str) -> Any:
-    """The rclpy class of the first of these types that is installed; None: none is."""
+    """Return the rclpy class of the first of these types that is installed, or None."""
     for name in type_names:
         try:
             return message_class(name)
@@ -35,12 +35,12 @@ def installed(*type_names: str) -> Any:
 
 
 def type_name(message_type: Any) -> str:
-    """The name of an rclpy class, such as ``geometry_msgs/msg/Pose``."""
+    """Return the name of an rclpy class, such as ``geometry_msgs/msg/Pose``."""
     return f"{message_type.__module__.split('.')[0]}/msg/{message_type.__name__}"
 
 
 def make_message(type_name: str, **fields: Any) -> Any:
-    """An rclpy message (see :data:`rs_localizer.io.messages.Make`)."""
+    """Make an rclpy message (see :data:`rs_localizer.io.messages.Make`)."""
     for name, value in fields.items():
         if isinstance(value, np.ndarray) and value.dtype == np.uint8:
             # rclpy checks every single element of any other container.
@@ -49,7 +49,7 @@ def make_message(type_name: str, **fields: Any) -> Any:
 
 
 def copy_message(source: Any, type_name: str) -> Any:
-    """The rclpy message of this type with the values of a message of rosbags."""
+    """Make the rclpy message of this type with the values of a message of rosbags."""
     fields = {}
     for name, kind in message_class(type_name).get_fields_and_field_types().items():
         value = getattr(source, name)
@@ -65,19 +65,19 @@ def copy_message(source: Any, type_name: str) -> Any:
 
 
 def xyz(vector: Any) -> Any:
-    """The numbers (3,) of a Point, a Vector3 or a Quaternion without its w."""
+    """Return the numbers (3,) of a Point, a Vector3 or a Quaternion without its w."""
     return np.array([vector.x, vector.y, vector.z])
 
 
 def create_output(node: LifecycleNode, kind: type, topic: str, *, overridable: bool = False) -> Any:
-    """A reliable publisher that publishes while the node is active; its QoS may have parameters."""
+    """Create a reliable publisher for an active node; its QoS may have parameters."""
     options = QoSOverridingOptions.with_default_policies() if overridable else None
     profile = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
     return node.create_lifecycle_publisher(kind, topic, profile, qos_overriding_options=options)
 
 
 def steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
-    """A timer (s) that goes on whatever ROS time does."""
+    """Create a timer (s) that goes on whatever ROS time does."""
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 

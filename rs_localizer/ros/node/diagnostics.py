@@ -56,12 +56,12 @@ class Health:
     subject: str = ""  # of the state
 
     def with_values(self, values: dict[str, str]) -> "Health":
-        """With these after the state and its subject."""
+        """Return the status with ``values`` appended after its state and subject."""
         return replace(self, values={"State": f"{self.state} {self.subject}".strip()} | values)
 
 
 def out_of_service(life_cycle: str) -> Health | None:
-    """Diagnosis of a node that is not active, by the label of its state; None if it is."""
+    """Return the health of a node that is not active, by the label of its state, or None."""
     if life_cycle == "active":
         return None
     # Somebody wants it so: no fault, which an aggregator would make of STALE.
@@ -70,12 +70,12 @@ def out_of_service(life_cycle: str) -> Health | None:
 
 
 def one_line(oddities: Mapping[str, str]) -> str:
-    """Oddities in one line."""
+    """Join oddities into one line."""
     return "; ".join(f"{name}: {text}" for name, text in oddities.items())
 
 
 def hindrance(summary: Summary, what: str) -> str:
-    """Reason for which some of the last messages have no result; empty where nearly all have."""
+    """Say why some of the last messages have no result; empty if nearly all have one."""
     lately, lost = summary.lately, summary.recently_missing
     came = lately.get(Event.RECEIVED, 0)
     for event, text in ((Event.REFUSED, "were refused"), (Event.REPLACED, "came too fast")):
@@ -90,7 +90,7 @@ def hindrance(summary: Summary, what: str) -> str:
 
 
 def counts(summary: Summary, what: str, done: str) -> dict[str, str]:
-    """Rates, latency and totals as values of a diagnosis; what is zero and rare is left out."""
+    """Return rates, latency and totals as values, without what is zero and rare."""
     values = {
         f"{what} in (Hz)": f"{summary.rate_in:.1f}",
         f"{done} (Hz)": f"{summary.rate_out:.1f}",
@@ -171,7 +171,7 @@ class Diagnostics:
             self._notice(self._lack if lacking else health.state, health.message)
 
     def _worth_a_line(self) -> bool:
-        """After 5, 10, 20, 40, ... periods in the same state, then every ten minutes."""
+        """Return True after 5, 10, 20 ... periods in a state, then every ten minutes."""
         times, rest = divmod(self._periods, _WORTH_A_LINE)
         if rest:
             return False

@@ -117,7 +117,7 @@ class ManagedNode(parameters.Started, LifecycleNode, Generic[Config, Result]):
         raise NotImplementedError
 
     def begin(self, config: Config) -> None:
-        """The node is active: listen, and say so."""
+        """Listen and say so: the node is active."""
         raise NotImplementedError
 
     def end(self) -> None:
@@ -129,7 +129,7 @@ class ManagedNode(parameters.Started, LifecycleNode, Generic[Config, Result]):
         raise NotImplementedError
 
     def examine(self) -> tuple[Health, str]:
-        """For the diagnostics: how the node is, and the frame of its camera (or empty)."""
+        """Return the health of the node, and the frame of its camera (or empty)."""
         raise NotImplementedError
 
     # -- what it has for that ----------------------------------------------------------------
@@ -185,7 +185,7 @@ class ManagedNode(parameters.Started, LifecycleNode, Generic[Config, Result]):
             return response
 
     def _arrived(self, state: str, result: TransitionCallbackReturn) -> TransitionCallbackReturn:
-        """The result of a transition to a state, which is the node's if it succeeds."""
+        """Return the result of a transition to a state, which the node takes if it succeeds."""
         if result == TransitionCallbackReturn.SUCCESS:
             self.state = state
         return result
@@ -314,7 +314,7 @@ def run(
 
 @contextlib.contextmanager
 def _ends_within(seconds: float, code: int) -> Iterator[None]:
-    """An end that the middleware holds up is cut short with this exit code, and says so."""
+    """End the process with this exit code if the middleware holds its end up, and say so."""
 
     def leave() -> None:
         sys.stderr.write(f"the node did not end within {seconds:g} s, and stands here:\n")
@@ -351,7 +351,7 @@ def _start(node: Any, stop: StopRequest) -> int:
 
 
 def executor_of(context: Context) -> Executor:
-    """An executor that costs a third of rclpy's others a message, where rclpy has it (7.1.4 on)."""
+    """Return an executor at a third of the cost per message, if rclpy has it (from 7.1.4)."""
     try:
         from rclpy.experimental import EventsExecutor
     except ImportError:

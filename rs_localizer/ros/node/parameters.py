@@ -73,7 +73,7 @@ def declare(node: Started, kind: type[Config]) -> Config:
 
 
 def _of_camera_file(given: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
-    """Values of ``camera_file``; a parameters file that holds the defaults does not change them."""
+    """Return values of ``camera_file``, which a file of defaults does not override."""
     file, known = given.get("camera_file"), settings(kind)
     if kind is not NodeConfig or not file:
         return {}
@@ -85,7 +85,7 @@ def _of_camera_file(given: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
 
 
 def _of_cameras(node: Node, kind: Kind) -> dict[str, Setting]:
-    """Settings of the cameras of a rig, which the parameters so far name."""
+    """Return settings of the cameras of a rig, which the parameters so far name."""
     if kind is not NodeConfig:
         return {}
     return camera_settings({name: node.get_parameter(name).value for name in settings(kind)})
@@ -108,7 +108,7 @@ def _declare(node: Any, names: Mapping[str, Setting], own: Mapping[str, Any]) ->
 
 
 def unknown_names(node: Started, kind: Kind) -> list[str]:
-    """Sentences on parameters that the node was started with and does not have.
+    """Return sentences on given parameters that the node does not have.
 
     No reason to refuse the start: a params file for ``/**`` speaks to several nodes.
     """
@@ -120,7 +120,7 @@ def _names(node: Node, kind: Kind) -> list[str]:
 
 
 def read(node: Node, kind: type[Config], changes: Sequence[Parameter] = ()) -> Config:
-    """The settings of the node's parameters, with these changes.
+    """Read the settings of the node's parameters, with these changes.
 
     Raises:
         ValueError: for values that the settings refuse.
@@ -197,7 +197,7 @@ def _descriptor(setting: Setting) -> ParameterDescriptor:
 
 
 def _constraints(setting: Setting) -> list[str]:
-    """Constraints that ranges cannot say."""
+    """Return constraints that ranges cannot express."""
     constraints = [f"one of {', '.join(setting.choices)}"] if setting.choices else []
     return constraints + (
         ["can be changed while the node is unconfigured"] if setting.fixed else []

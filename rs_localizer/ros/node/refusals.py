@@ -61,14 +61,14 @@ class Refusals:
             self._log(line)
 
     def recent(self, reasons: Collection[str], seconds: float) -> dict[str, str]:
-        """Reasons of these that were noticed in the last seconds, with their latest details."""
+        """Return those of these reasons that were noticed lately, with their latest details."""
         with self._lock:
             since = self._clock() - seconds
             latest = {reason: self._latest.get(reason) for reason in reasons}
             return {k: item[1] for k, item in latest.items() if item and item[0] >= since}
 
     def _line(self, reason: str, detail: str) -> str | None:
-        """A line for the log; None if it has been said."""
+        """Return a line for the log; None if it has been said."""
         now = self._clock()
         kinds = self._logged.setdefault(reason, {})
         kind = re.sub(r"\d+", "0", detail)
@@ -84,7 +84,7 @@ class Refusals:
 
 
 def _room_for(kind: str, kinds: dict[str, _Logged], now: float) -> str:
-    """The name under which a new kind is kept, so that there are never many."""
+    """Return the name under which a new kind is kept, so that there are never many."""
     if len(kinds) < _MOST_KINDS:
         return kind
     for old in [k for k, logged in kinds.items() if now - logged.when >= _PERIOD and k != _OTHERS]:
@@ -93,6 +93,6 @@ def _room_for(kind: str, kinds: dict[str, _Logged], now: float) -> str:
 
 
 def describe(error: Exception) -> str:
-    """An error that nobody foresaw, in one line: what, and where."""
+    """Describe an unforeseen error in one line: what, and where."""
     where = traceback.extract_tb(error.__traceback__)[-1]
     return f"{error!r} in {where.name}, {where.filename}:{where.lineno}"

@@ -23,7 +23,7 @@ _MOST_LOOSE = 0.1  # share of intervals that may be further off
 
 
 def missing(stamps_ns: Sequence[int]) -> int:
-    """Number of frames missing between these; 0 where the stamps are not of a steady rate.
+    """Return the number of frames missing between stamps; 0 if their rate is not steady.
 
     Args:
         stamps_ns: in the order of arrival.
@@ -128,12 +128,12 @@ class Statistics(Generic[Result]):
         self._events.append((self._clock(), event, what))
 
     def received(self, topic: str, message: Any) -> None:
-        """A frame has come: a message with a header."""
+        """Count a frame that has come, a message with a header."""
         with self._lock:
             self._add(Event.RECEIVED, (topic, stamp_ns(message)))
 
     def restart(self) -> None:
-        """Time has jumped: frames before and after are not compared."""
+        """Forget frames before a jump of time: they are not compared with later ones."""
         with self._lock:
             self._events.clear()
 
@@ -146,7 +146,7 @@ class Statistics(Generic[Result]):
             self._add(Event.DROPPED, count=count)
 
     def started(self) -> None:
-        """The worker has taken a frame."""
+        """Note that the worker has taken a frame."""
         self._started = self._clock()
 
     def ended(self) -> None:
@@ -159,7 +159,7 @@ class Statistics(Generic[Result]):
         self._refusals.add(refusal.reason, refusal.detail)
 
     def answered(self, result: Result, received: float) -> None:
-        """A result was published of a frame that had been received at this time of the clock."""
+        """Count a published result of a frame that was received at this time of the clock."""
         input_stamp_ns, kept = self._tell(result)
         delay = (self._ros_time() - input_stamp_ns) * 1e-9
         with self._lock:
@@ -168,7 +168,7 @@ class Statistics(Generic[Result]):
             self._last = kept
 
     def summary(self) -> Summary:
-        """The state of the frames now."""
+        """Return the state of the frames now."""
         with self._lock:
             now, started = self._clock(), self._started
             recent = [item for item in self._events if item[0] >= now - WINDOW]
@@ -198,7 +198,7 @@ class Statistics(Generic[Result]):
 
 
 def _rate(times: list[float]) -> float:
-    """Hz; of a single moment nothing can be said."""
+    """Return the rate (Hz) of these times; one moment has none."""
     span = times[-1] - times[0] if times else 0.0
     return (len(times) - 1) / span if span > 0.0 else 0.0
 

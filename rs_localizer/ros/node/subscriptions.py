@@ -34,12 +34,12 @@ def policies(profile: QoSProfile) -> Policies:
 
 
 def node_of(publisher: Any) -> str:
-    """Full name of the node of a TopicEndpointInfo."""
+    """Return the full name of the node of a TopicEndpointInfo."""
     return f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
 
 
 def best(wished: Policies, offers: Sequence[Policies]) -> Policies:
-    """Policies that are wished; for ``BEST_AVAILABLE`` the most that all publishers offer.
+    """Return the wished policies; for ``BEST_AVAILABLE`` the most that all publishers offer.
 
     A subscription that asks for more than a publisher offers hears nothing; one that asks for less
     loses what is large (of reliable clouds of 2 MB a best-effort subscription of Fast DDS heard 3
@@ -145,7 +145,7 @@ class Inputs:
         return [subscription.topic_name for subscription in self._subscriptions.values()]
 
     def silence(self) -> dict[str, Silence]:
-        """Silences of the topics, by the names that the node gave them."""
+        """Return silences of the topics, by the names that the node gave them."""
         return {name: self._silence(name) for name in self._subscriptions}
 
     def close(self) -> None:
@@ -217,7 +217,7 @@ class Inputs:
         return Silence(topic, seconds, heard is not None, cause, mismatch, reliable)
 
     def _cause(self, subscription: Subscription) -> tuple[str, bool]:
-        """The cause that nothing is heard, and whether it is the QoS or the type."""
+        """Return why nothing is heard, and whether the cause is the QoS or the type."""
         wanted = type_name(subscription.msg_type)
         unfit = []
         publishers = self._node.get_publishers_info_by_topic(subscription.topic_name)

@@ -40,7 +40,7 @@ class MapView:
         self._shown: Array | None = None
 
     def show(self, frame: str, points: Array | None) -> None:
-        """Landmarks (n,3) or corners of markers (n,4,3); again only if they are others."""
+        """Show landmarks (n,3) or corners of markers (n,4,3), again only if they have changed."""
         if points is not None and points is not self._shown:
             self._shown = points
             self._publisher.publish(MarkerArray(markers=[map_marker(frame, points)]))
@@ -50,7 +50,7 @@ class MapView:
 
 
 def map_marker(frame: str, points: Array) -> Marker:
-    """Landmarks (n,3) as points, or markers (n,4,3) as outlines."""
+    """Return landmarks (n,3) as points, or markers (n,4,3) as outlines."""
     squares = points.ndim == 3
     marker = _marker(frame, 0, Marker.LINE_LIST if squares else Marker.POINTS, (0.4, 0.7, 1.0))
     marker.scale.x = marker.scale.y = _LINE if squares else _POINT
@@ -63,7 +63,7 @@ def map_marker(frame: str, points: Array) -> Marker:
 
 
 def camera_marker(frame: "Localized", corners: Array) -> Marker:
-    """The camera's view at the middle row: its colour says how far the pose is to be trusted.
+    """Return the camera's view at the middle row, coloured by the trust in the pose.
 
     Args:
         frame: localized.

@@ -31,7 +31,7 @@ _MOST_LATE = 100
 
 
 def _nothing(message: Any) -> float:
-    """A frame that waits for nothing."""
+    """Return the time that a frame waits: none."""
     return 0.0
 
 
@@ -83,7 +83,7 @@ class Worker(Generic[Result]):
         threading.Thread(target=self._run, name=_NAME, daemon=True).start()
 
     def update(self, kind: str, update: Callable[[], None]) -> None:
-        """Have this done before the next frame, after all updates of other kinds so far.
+        """Queue this before the next frame, after all updates of other kinds so far.
 
         An older one of the same kind that still waits is dropped: an update says how things are
         now, not what has changed.
@@ -94,7 +94,7 @@ class Worker(Generic[Result]):
             self._changed.notify()
 
     def process(self, topic: str, message: Any) -> None:
-        """Have this frame processed and published, unless a newer one of its topic comes first.
+        """Queue a frame to be processed, unless a newer one of its topic comes first.
 
         That takes its place. While a frame lacks something it waits, and those behind it, too.
         """
@@ -107,7 +107,7 @@ class Worker(Generic[Result]):
             self._statistics.replaced()
 
     def look(self) -> None:
-        """Something has come that a frame may have waited for."""
+        """Look again at waiting frames: something has come."""
         if self._early:
             with self._changed:
                 self._woken = True
@@ -157,7 +157,7 @@ class Worker(Generic[Result]):
         return not self._closed
 
     def _is_ready(self) -> bool:
-        """True if there is a frame that need not wait."""
+        """Return True if there is a frame that need not wait."""
         if not self._early:
             return False
         frame = self._early[0]
@@ -200,7 +200,7 @@ class Worker(Generic[Result]):
             self._finish(frame, result)
 
     def _attempt(self, function: Callable[[], Any]) -> Any:
-        """The function's value, or a refusal where it fails."""
+        """Return the function's value, or a refusal if it fails."""
         try:
             return function()
         except Exception as error:  # of one message: the others go on

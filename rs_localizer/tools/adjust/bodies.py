@@ -21,13 +21,13 @@ _STRETCH = 3e-3
 
 
 def is_flat(points: Array) -> bool:
-    """True where points (p,3) lie in one plane."""
+    """Return True if points (p,3) lie in one plane."""
     sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(sizes[2] < _FLAT * sizes[0])
 
 
 def paper_covariance(points: Array, deviation: float) -> Array:
-    """Covariance (3 p, 3 p) of what the points (p,3) of a flat print are off their places.
+    """Return the covariance (3 p, 3 p) of the errors of points (p,3) on a flat print.
 
     Out of the plane low polynomials, which neither turn nor shift it, in the plane stretch and
     shear; and of each point by itself its ``deviation`` (m).
@@ -69,14 +69,14 @@ class Pieces:
         return self.width * self.count
 
     def centres(self, landmarks: Array) -> Array:
-        """Middles (c,3) of the parts of landmarks (p,3)."""
+        """Return the middles (c,3) of the parts of landmarks (p,3)."""
         free = self.slots >= 0
         members = np.bincount(self.slots[free], minlength=self.count)
         sums = [np.bincount(self.slots[free], of, self.count) for of in landmarks[free].T]
         return np.column_stack(sums) / members[:, None]
 
     def arms(self, landmarks: Array) -> Array:
-        """From the middle of its part to each landmark (p,3); zeros where it is known."""
+        """Return vectors (p,3) from the middle of its part to each landmark; zeros where known."""
         arms = np.zeros_like(landmarks)
         if self.rigid:
             free = self.slots >= 0
@@ -84,7 +84,7 @@ class Pieces:
         return arms
 
     def moved(self, landmarks: Array, step: Array) -> Array:
-        """The landmarks (p,3) after a step (columns,)."""
+        """Return the landmarks (p,3) after a step (columns,)."""
         step, free = step.reshape(-1, self.width), self.slots >= 0
         moved, own = landmarks.copy(), self.slots[free]
         moved[free] += step[own, :PLACE]

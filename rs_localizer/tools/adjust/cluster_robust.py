@@ -39,13 +39,13 @@ class Pull:
     expected: float  # of independent errors of the noise that the covariance stands for
 
     def inflation(self, independent: float) -> float:
-        """Factor of the covariance, if it would be so large for independent errors."""
+        """Return the factor of the covariance, unless independent errors explain it."""
         share = (self.measured + _DOUBT * independent) / (self.expected + _DOUBT)
         return max(share, independent)
 
 
 def cluster_robust(problem: Problem, fitted: Fit) -> Fit:
-    """The estimate with covariances as large as its own errors show.
+    """Return the estimate with covariances as large as its own errors show.
 
     Args:
         problem: whose minimum it is, with the same freedom and without delays of images.
@@ -61,7 +61,7 @@ def cluster_robust(problem: Problem, fitted: Fit) -> Fit:
 
 
 def _pull(problem: Problem, fitted: Fit) -> Pull:
-    """In units in which the border has covariance 1, the controls following it."""
+    """Return pulls in units in which the border has covariance 1, and the controls follow it."""
     factored = fitted.factored
     covariance = factored.border_covariance()
     unit = np.zeros((problem.groups.kept, problem.border))
@@ -79,7 +79,7 @@ def _pull(problem: Problem, fitted: Fit) -> Pull:
 
 
 def by_seconds(problem: Problem, fitted: Fit, number: int) -> tuple[Array, Array]:
-    """How far each second by itself would move one number of the border, all else following.
+    """Return how far each second alone would move one number of the border, the rest following.
 
     Of one number few seconds say more than one factor of all: a motion that the spline does not
     follow pulls at the readout time, and hardly at places.
@@ -109,13 +109,13 @@ def by_seconds(problem: Problem, fitted: Fit, number: int) -> tuple[Array, Array
 
 
 def _seconds(times: Array) -> list[tuple[int, int]]:
-    """First and end of the keypoints of each second, at rising times (n,)."""
+    """Return the first and end of the keypoints of each second, at rising times (n,)."""
     starts = np.flatnonzero(np.diff(np.floor(times / SECONDS), prepend=-np.inf))
     return list(zip(starts.tolist(), [*starts[1:].tolist(), len(times)], strict=True))
 
 
 def pull_at_landmarks(rows: Array, landmarks: IntArray, times: Array, held: Array) -> Pull:
-    """Pull of errors at landmarks, the motion taken for given.
+    """Return the pull of errors at landmarks for a given motion.
 
     Args:
         rows: (n,2,4) whitened derivatives by the landmark, and the error.

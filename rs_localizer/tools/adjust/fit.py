@@ -48,7 +48,7 @@ class Fit:
         return float(np.sqrt(self.border_covariance[0, 0])) if free else np.nan
 
     def state_covariances(self, times: Array) -> Array:
-        """Covariances (m,12,12) at times (m,): turn, position, body rate, velocity."""
+        """Return covariances (m,12,12) at times (m,): rotation, position, body rate, velocity."""
         first, jacobians = self.state.spline.jacobians(times)
         inner = self.inflation * self.factored.local_covariances(first)
         covariances: Array = jacobians @ inner @ np.swapaxes(jacobians, 1, 2)
@@ -62,7 +62,7 @@ def fit(
     freedom: Freedom,
     deviation: float | None = None,
 ) -> Fit:
-    """The most likely motion and shared numbers.
+    """Fit the most likely motion and shared numbers.
 
     Args:
         camera: lens model, size and scan direction; its readout time and numbers do not matter.
@@ -79,7 +79,7 @@ def fit(
 
 
 def solve(problem: Problem, start: Unknowns, deviation: float | None = None) -> Fit:
-    """:func:`fit` of one camera or of a rig, whose noise is that of its first camera's keypoints.
+    """Solve :func:`fit` for one camera or a rig; the noise is that of the first camera.
 
     Raises:
         Undetermined: when the keypoints do not determine what is free.
@@ -95,7 +95,7 @@ def solve(problem: Problem, start: Unknowns, deviation: float | None = None) -> 
 def cost_at(
     camera: Camera, observations: SplineKeypoints, fitted: Fit, readout_time: float
 ) -> float:
-    """The least cost with this readout time (s), to be compared with ``fitted.cost``.
+    """Return the least cost with this readout time (s), to be compared with ``fitted.cost``.
 
     Less exact where it is far from the least of all.
     """
@@ -107,14 +107,14 @@ def cost_at(
 
 
 def cheaper(richer: Fit, plainer: Fit, parameters: float) -> bool:
-    """True where so many more parameters are worth it, by the noise of the richer model."""
+    """Return True if so many more parameters are worth it, by the noise of the richer model."""
     limit = (LIMIT * richer.deviation) ** 2
     costs = [float(np.sum(fitted.squared_errors.clip(max=limit))) for fitted in (plainer, richer)]
     return (costs[0] - costs[1]) / richer.deviation**2 > _COST_PER_PARAMETER * parameters
 
 
 def image_speeds(camera: Camera, observations: SplineKeypoints, state: Unknowns) -> Array:
-    """How fast the keypoints (n,) move in their images, px/s."""
+    """Return the speeds (n,), px/s, of the keypoints in their images."""
     problem = Problem([CameraView(camera, observations, Freedom())], state)
     sights = problem.sights(state)[0]
     local, velocity = sights.local, sights.velocity
@@ -123,7 +123,7 @@ def image_speeds(camera: Camera, observations: SplineKeypoints, state: Unknowns)
 
 
 def _finish(problem: Problem, state: Unknowns, deviation: float) -> Fit:
-    """The estimate with its covariances."""
+    """Return the estimate with its covariances."""
     squared = problem.errors(state)
     system = problem.system(state, deviation)
     factored = Factored(system)
@@ -145,7 +145,7 @@ def _finish(problem: Problem, state: Unknowns, deviation: float) -> Fit:
 
 
 def inflation_of(squared: Array, deviation: float, used: int) -> float:
-    """How the covariance of the M-estimator differs from the inverse of its normal matrix.
+    """Return the factor from the inverse normal matrix to the M-estimator's covariance.
 
     Huber's formula, ``E psi^2 / (E psi')^2``, where the matrix has the mean weight instead; and
     the freedoms that the motion used up.
@@ -157,12 +157,12 @@ def inflation_of(squared: Array, deviation: float, used: int) -> float:
 
 
 def steepness(squared: Array, deviation: float) -> float:
-    """Mean weight by ``E psi'``: how much the normal matrix is too steep for Tukey's estimator."""
+    """Return the mean weight over ``E psi'``, the normal matrix's excess for Tukey's estimator."""
     share = squared / (LIMIT * deviation) ** 2
     weight = (1.0 - share) ** 2
     return float(np.mean(weight) / np.mean(weight - 2.0 * share * (1.0 - share)))
 
 
 def left_over(keypoints: int, used: int) -> float:
-    """Factor by which the noise's variance exceeds the mean square that is left."""
+    """Return the factor by which the noise's variance exceeds the mean square that is left."""
     return 2.0 * keypoints / max(2.0 * keypoints - used, 1.0)

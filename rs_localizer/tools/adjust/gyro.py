@@ -43,7 +43,7 @@ class Gyroscope:
         self.start = start.mount
 
     def _linearized(self, state: Unknowns) -> tuple[IntArray, Array, Array]:
-        """First controls (k,), derivatives (k,3,24 + 13) by controls and mount, errors (k,3)."""
+        """Return first controls (k,), derivatives (k,3,24 + 13) and errors (k,3) of the samples."""
         mount = state.mount
         assert mount is not None
         times = self.samples.times + mount.delay
@@ -65,12 +65,12 @@ class Gyroscope:
         return np.asarray(rates @ mount.matrix.T + mount.bias - self.samples.rates)
 
     def noise(self, state: Unknowns) -> float:
-        """Standard deviation of an axis (rad/s), by the errors' median."""
+        """Return the standard deviation of an axis (rad/s), by the errors' median."""
         squared = np.sum(np.square(self._errors(state)), axis=1)
         return float(np.sqrt(np.median(squared) / _MEDIAN))
 
     def terms(self, state: Unknowns, column: int) -> list[Rows | Quadratic]:
-        """Samples with Tukey's weights, and what is known of the mount, from a column on."""
+        """Return rows of samples with Tukey's weights, and priors of the mount from a column on."""
         first, values, errors = self._linearized(state)
         deviation, squared = self.samples.deviation, np.sum(np.square(errors), axis=1)
         rest = np.maximum(1.0 - squared / (_LIMIT * deviation) ** 2, 0.0)
@@ -86,7 +86,7 @@ class Gyroscope:
 
 
 def by_shape(rates: Array) -> Array:
-    """Derivative (k,3,6) of ``shape rate`` by the six numbers of a symmetric matrix."""
+    """Return the derivative (k,3,6) of ``shape rate`` by the six numbers of a symmetric matrix."""
     out = np.zeros((len(rates), 3, 6))
     for axis in range(3):
         others = [other for other in range(3) if other != axis]

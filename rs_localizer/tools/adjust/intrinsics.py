@@ -33,7 +33,7 @@ class LensErrors(NamedTuple):
     aspect_ratio: float  # share, of fy over fx
 
     def or_half(self, difference: LensErrors) -> LensErrors:
-        """Together with half of what two halves of a recording differ by."""
+        """Return the errors, enlarged by half the difference of two halves of a recording."""
         return LensErrors(
             *(float(np.hypot(a, 0.5 * b)) for a, b in zip(self, difference, strict=True))
         )
@@ -48,7 +48,7 @@ class Projected(NamedTuple):
 
 
 def lens_values(camera: Camera) -> Array:
-    """The numbers (m,) of a camera's lens: fx, fy, cx, cy, distortion (zeros where it has none)."""
+    """Return the numbers (m,) of a camera's lens: fx, fy, cx, cy, distortion (zeros if none)."""
     D = camera.D
     if len(D) == 0:
         D = np.zeros(len(camera.law.orders))
@@ -57,7 +57,7 @@ def lens_values(camera: Camera) -> Array:
 
 
 def with_lens(camera: Camera, values: Array) -> Camera:
-    """The camera with these numbers.
+    """Return the camera with these numbers.
 
     Raises:
         ValueError: for numbers that no camera has.
@@ -68,7 +68,7 @@ def with_lens(camera: Camera, values: Array) -> Camera:
 
 
 def project(camera: Camera, values: Array, points: Array, free: bool) -> Projected:
-    """Raw pixels of points (n,3) before the camera, seen through a lens of these numbers (m,).
+    """Project points (n,3) before the camera through a lens of these numbers (m,).
 
     Without ``free`` the derivatives by the lens are left out.
     """
@@ -83,7 +83,7 @@ def project(camera: Camera, values: Array, points: Array, free: bool) -> Project
 
 
 def lens_prior(camera: Camera, deviations: tuple[float, float] | None) -> tuple[Array, Array]:
-    """Mean (m,) and information (m,m) of a lens whose numbers are estimated.
+    """Return the mean (m,) and information (m,m) of a lens whose numbers are estimated.
 
     Args:
         camera: a given lens, or a first guess of an unknown one.
@@ -115,14 +115,14 @@ def lens_prior(camera: Camera, deviations: tuple[float, float] | None) -> tuple[
 
 
 def lens_errors(camera: Camera, covariance: Array) -> LensErrors:
-    """Errors of pixels by a covariance (m,m) of a camera's lens numbers."""
+    """Return the errors of pixels by a covariance (m,m) of a camera's lens numbers."""
     rays, design = _field(camera)
     by_lens = project(camera, lens_values(camera), rays, True).by_lens
     return _parts(design, (by_lens @ _root(covariance)).reshape(2 * len(rays), -1))
 
 
 def lens_difference(camera: Camera, other: Camera) -> LensErrors:
-    """Difference of another lens from this one."""
+    """Return the difference of another lens from this one."""
     rays, design = _field(camera)
     off = project(other, lens_values(other), rays, False).pixels
     off -= project(camera, lens_values(camera), rays, False).pixels
@@ -149,7 +149,7 @@ def _field(camera: Camera) -> tuple[Array, Array]:
 
 
 def _parts(design: Array, moved: Array) -> LensErrors:
-    """Parts of displacements (2 n, k) of pixels, k of them independent."""
+    """Split displacements (2 n, k) of pixels, k of them independent, into their parts."""
     numbers = np.linalg.lstsq(design, moved, rcond=None)[0]
     rest = (moved - design @ numbers)[:8]  # the corners
     size = np.sqrt(np.sum(numbers**2, axis=1))
@@ -162,6 +162,6 @@ def _parts(design: Array, moved: Array) -> LensErrors:
 
 
 def _root(covariance: Array) -> Array:
-    """A matrix whose product with its transpose is the covariance."""
+    """Return a matrix whose product with its transpose is the covariance."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -22,14 +22,14 @@ from rs_localizer.tools.adjust.variables import Freedom
 
 
 def _places(layout: Layout) -> tuple[IntArray, IntArray]:
-    """Controls with an acceleration (k,), and 1 for the first one of a stretch, otherwise 0."""
+    """Return controls with an acceleration (k,), and 1 for the first one of a stretch, else 0."""
     parts = [np.arange(first + 1, last - 1) for first, last in pairwise(layout.firsts.tolist())]
     begins = np.concatenate([np.arange(len(part)) == 0 for part in parts]).astype(np.int64)
     return np.concatenate(parts), begins
 
 
 def acceleration_rows(spline: Spline, expected: Freedom) -> Rows:
-    """Six rows for each control with an acceleration: turns, then places."""
+    """Return six rows for each control with an acceleration: rotations, then positions."""
     spacing, fading = spline.layout.spacing, expected.fading
     at, begins = _places(spline.layout)
     vectors, inverses = spline.steps()
@@ -63,7 +63,7 @@ def acceleration_rows(spline: Spline, expected: Freedom) -> Rows:
 
 
 def rest_rows(spline: Spline, angular: float, linear: float) -> Rows:
-    """Zero-mean velocities (rad/s, m/s) in stretches of a single interval."""
+    """Return rows of zero-mean velocities (rad/s, m/s) in stretches of a single interval."""
     at = spline.layout.alone()
     vectors, inverses = spline.steps()
     values, errors = np.zeros((len(at), 6, 2 * CONTROL)), np.zeros((len(at), 6))

@@ -45,7 +45,7 @@ class Posed:
 
 
 def in_order(images: Iterable[ImagePoints]) -> list[ImagePoints]:
-    """Images by their stamps, one for each, and only those that show something."""
+    """Return images that show something by their stamps, one for each."""
     once = {image.stamp_ns: image for image in images if len(image.points)}
     return [once[stamp] for stamp in sorted(once)]
 
@@ -53,7 +53,7 @@ def in_order(images: Iterable[ImagePoints]) -> list[ImagePoints]:
 def localize_each(
     camera: Camera, images: list[ImagePoints], done: Callable[[], object] = lambda: None
 ) -> list[Estimate | Failure]:
-    """Each image on its own: the readout time need not be known.
+    """Localize each image on its own: the readout time need not be known.
 
     Nor need the lens be right: where it is too wrong for a pose to be published, a rough one is a
     start for an estimator that finds the lens as well.
@@ -74,7 +74,7 @@ def localize_each(
 def collect(
     camera: Camera, images: list[ImagePoints], results: list[Estimate | Failure], delay: float = 0.0
 ) -> Posed:
-    """Keypoints and poses of images in the order of their stamps.
+    """Return keypoints and poses of images in the order of their stamps.
 
     Args:
         delay: s from the stamp to the middle row's exposure; while the readout time is unknown it

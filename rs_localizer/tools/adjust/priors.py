@@ -16,14 +16,14 @@ _FLOAT = 1e-3
 
 
 def known(offset: Array, information: Array, first: int) -> Quadratic:
-    """Numbers (k,) of the border, from ``first`` on, that are so far off what is known of them."""
+    """Return the prior of numbers (k,) of the border, from ``first`` on, with these offsets."""
     slope = information @ offset
     columns = np.arange(first, first + len(offset))
     return Quadratic(columns, information, slope, float(offset @ slope))
 
 
 def block_rows(offsets: Array, deviations: Array, first: int) -> Rows:
-    """Blocks (b,w) of unknowns, from ``first`` on, known to deviations (b,) each by itself."""
+    """Return priors of blocks (b,w) of unknowns, from ``first`` on, with deviations (b,)."""
     count, width = offsets.shape
     values = np.eye(width) / deviations[:, None, None]
     errors = offsets / deviations[:, None]
@@ -42,7 +42,7 @@ class Floating:
         self._weights = 1.0 / (_FLOAT * np.array([size, size, size, 1.0, 1.0, 1.0, 1.0]))
 
     def rows(self, spline: Spline) -> Rows:
-        """Mean shift, mean turn, relative size."""
+        """Return rows of mean shift, mean rotation and relative size."""
         count = len(spline.positions)
         shift = spline.positions - self._start.positions
         turned = spline.rotations @ np.swapaxes(self._start.rotations, 1, 2)

@@ -118,11 +118,11 @@ class Problem:
         return self.groups.border
 
     def place(self, name: str, view: int = 0) -> int:
-        """First of a camera's numbers in the border."""
+        """Return the index of a camera's first number in the border."""
         return self.at[view][name] - self.groups.motion
 
     def states(self, state: Unknowns) -> list[Unknowns]:
-        """Those of the cameras, of one spline."""
+        """Return the unknowns of each camera, on one spline."""
         return self._on_spline(state)[1]
 
     def _on_spline(self, state: Unknowns) -> tuple[Curve, list[Unknowns]]:
@@ -136,22 +136,22 @@ class Problem:
         return self._last[1:]
 
     def sights(self, state: Unknowns) -> list[Projections]:
-        """The keypoints of each camera, on the spline."""
+        """Return the keypoints of each camera, on the spline."""
         curve, states = self._on_spline(state)
         return [of.projections(curve, own) for of, own in zip(self.keypoints, states, strict=True)]
 
     def keypoint_rows(self, state: Unknowns, deviation: float) -> list[Rows]:
-        """Rows of each camera, at a standard deviation of the noise (px)."""
+        """Return the rows of each camera, at a standard deviation of the noise (px)."""
         curve, states = self._on_spline(state)
         parts = zip(self.keypoints, states, self.at, self.ratios.tolist(), strict=True)
         return [of.rows(curve, own, at, deviation * ratio) for of, own, at, ratio in parts]
 
     def system(self, state: Unknowns, deviation: float) -> System:
-        """Cost and normal equations at a standard deviation of the noise (px)."""
+        """Return the cost and normal equations at a standard deviation of the noise (px)."""
         return System(self.groups, self.terms(state, deviation))
 
     def terms(self, state: Unknowns, deviation: float) -> list[Rows | Quadratic]:
-        """All that is measured and known."""
+        """Return all measurements and priors."""
         terms: list[Rows | Quadratic] = [*self.keypoint_rows(state, deviation)]
         terms += self._expected_motion(state)
         for k, own in enumerate(self.states(state)):
@@ -173,7 +173,7 @@ class Problem:
         return rows
 
     def _known(self, k: int, own: Unknowns) -> list[Rows | Quadratic]:
-        """Priors of a camera's unknowns."""
+        """Return the priors of a camera's unknowns."""
         terms: list[Rows | Quadratic] = []
         view, at, pieces = self.views[k], self.at[k], self.pieces[k]
         freedom = view.freedom
@@ -200,7 +200,7 @@ class Problem:
         return terms
 
     def moved(self, state: Unknowns, step: Array) -> Unknowns:
-        """The state after a step of all unknowns."""
+        """Return the state after a step of all unknowns."""
         spline = state.spline.moved(step[: self.groups.motion])
         states = enumerate(self.states(state))
         first, *others = (self._camera_moved(k, own, step) for k, own in states)
@@ -226,33 +226,33 @@ class Problem:
         return replace(own, **changed)  # type: ignore[arg-type]
 
     def errors(self, state: Unknowns) -> Array:
-        """Squared whitened errors (n,), px^2 of the first camera."""
+        """Return the squared whitened errors (n,), px^2 of the first camera."""
         curve, states = self._on_spline(state)
         parts = zip(self.keypoints, states, self.ratios, strict=True)
         return np.concatenate([of.squared_errors(curve, own) / r**2 for of, own, r in parts])
 
     def noise(self, state: Unknowns, deviation: float) -> float:
-        """Standard deviation of the noise (px), from errors that the last one lets count."""
+        """Return the noise deviation (px), from errors that count by the last one."""
         return max(noise_of(self.errors(state), deviation), self.freedom.least_noise)
 
     def of_views(self, views: Sequence[CameraView], start: Unknowns) -> Problem:
-        """The same of other views of the cameras."""
+        """Return the same of other views of the cameras."""
         floating = self.floating is not None
         return Problem(views, start, self.noises, self._one_map, self.deviations, floating)
 
     def trusted(self, start: Unknowns) -> Problem:
-        """The same with the trusted keypoints only."""
+        """Return the problem with the trusted keypoints only."""
         return self.of_views([view.subset(view.observations.trusted) for view in self.views], start)
 
     def images(self, inliers: BoolArray) -> int:
-        """How many images of all cameras have some of these keypoints (n,)."""
+        """Count images of all cameras with some of these keypoints (n,)."""
         frames = [view.observations.frames for view in self.views]
         parts = np.split(inliers, np.cumsum([len(own) for own in frames])[:-1])
         return sum(len(np.unique(of[own])) for of, own in zip(frames, parts, strict=True))
 
 
 def minimise(problem: Problem, state: Unknowns, deviation: float, steps: int = _STEPS) -> Unknowns:
-    """The state of least cost near to this one, by Levenberg and Marquardt, after so many steps."""
+    """Minimize the cost near a state, by Levenberg and Marquardt, in so many steps."""
     system = problem.system(state, deviation)
     damping = _FIRST_DAMPING
     most = LIMIT**2 / 3.0 * sum(len(view.observations.points) for view in problem.views)
@@ -288,7 +288,7 @@ def fit_with_noise(problem: Problem, state: Unknowns, deviation: float) -> tuple
 
 
 def noise_of(squared: Array, deviation: float) -> float:
-    """Standard deviation of the noise, from squared errors (n,) that are not far off the last one.
+    """Return the noise deviation, from squared errors (n,) that are near the last one.
 
     Raises:
         Undetermined: when there are none.
@@ -300,7 +300,7 @@ def noise_of(squared: Array, deviation: float) -> float:
 
 
 def _pieces(view: CameraView, every: bool) -> Pieces:
-    """The free parts of the map: all of it, bodies, or the landmarks that are seen."""
+    """Return the free parts of the map: all of it, bodies, or the landmarks that are seen."""
     observations, freedom = view.observations, view.freedom
     if every:
         return Pieces(np.arange(len(observations.landmarks)), rigid=False)
@@ -314,7 +314,7 @@ def _pieces(view: CameraView, every: bool) -> Pieces:
 
 
 def _shape_information(view: CameraView, pieces: Pieces) -> Array | None:
-    """Information on the shape of a flat print; None: it is none."""
+    """Return the information on the shape of a flat print; None if it is none."""
     if not (view.freedom.paper and pieces.count and not pieces.rigid):
         return None
     landmarks = view.observations.landmarks[pieces.slots >= 0]

@@ -48,7 +48,7 @@ class Reprojection:
         self._last: tuple[Unknowns, Projections] | None = None
 
     def projections(self, curve: Curve, own: Unknowns) -> Projections:
-        """All keypoints on the spline."""
+        """Return all keypoints on the spline."""
         if self._last and self._last[0] is own:
             return self._last[1]
         seen = self.observations
@@ -69,7 +69,7 @@ class Reprojection:
         return sights
 
     def terms(self, own: Unknowns, deviation: float) -> Terms:
-        """At a standard deviation of the noise (px)."""
+        """Return the terms at a standard deviation of the noise (px)."""
         free, width = self.free, self.pieces.width if self.pieces.count else 0
         return Terms(
             float(own.readout_time), self.camera.row_time_gradient, free.readout_time, free.lens,
@@ -78,14 +78,14 @@ class Reprojection:
         )  # fmt: skip
 
     def squared_errors(self, curve: Curve, own: Unknowns) -> Array:
-        """Squared whitened errors (n,), px^2; infinite for keypoints that say nothing."""
+        """Return squared whitened errors (n,), px^2; infinite for keypoints without one."""
         sights = self.projections(curve, own)
         squared = np.empty(len(sights.first))
         squared_errors(sights, self.terms(own, 1.0), squared)
         return squared
 
     def rows(self, curve: Curve, own: Unknowns, at: Mapping[str, int], deviation: float) -> Rows:
-        """Whitened rows.
+        """Return the whitened rows.
 
         Args:
             at: where the camera's unknowns begin among all.

@@ -74,7 +74,7 @@ def look(
     curve: Curve, first: IntArray1, u: Array1, points: Array2, axes: Array2, centre: Array1,
     local: Out[Array2], velocity: Out[Array2],
 ) -> None:  # fmt: skip
-    """Points (n,3) in camera axes at their own times, and their velocities there."""
+    """Write points (n,3) in camera axes at their own times, and their velocities."""
     work, rotation, position = np.empty((8, 3, 3)), np.empty((3, 3)), np.empty(3)
     rate, away, moving = np.empty((4, 3)), np.empty(3), np.empty(3)
     for n in range(len(first)):
@@ -137,7 +137,7 @@ def _whitened(sights: Projections, terms: Terms, n: int, by_point: Array, flow: 
 
 @entry
 def squared_errors(sights: Projections, terms: Terms, out: Out[Array1]) -> None:
-    """Squared whitened errors (n,), px^2; infinite for keypoints that say nothing."""
+    """Write squared whitened errors (n,), px^2; infinite for keypoints without one."""
     by_point, flow = np.empty((2, 3)), np.empty((4, 2))
     for n in range(len(sights.first)):
         if _whitened(sights, terms, n, by_point, flow):

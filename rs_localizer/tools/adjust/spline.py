@@ -23,7 +23,7 @@ LONGEST_SPACING = 0.05
 
 
 def stretches(times: Array) -> list[IntArray]:
-    """Indices of the frames at sorted times (f,), s, cut at the gaps; short parts left out."""
+    """Return indices of the frames at sorted times (f,), s, cut at gaps, without short parts."""
     if len(times) < 2:
         return []
     intervals = np.diff(times)
@@ -36,7 +36,7 @@ def stretches(times: Array) -> list[IntArray]:
 def first_spline(
     times: Array, rotations: Array, positions: Array, spacing: float, margin: float
 ) -> Spline:
-    """A spline whose controls lie on the poses (f,3,3), (f,3), map_from_camera, at times (f,).
+    """Return a spline with controls on the poses (f,3,3), (f,3), map_from_camera, at times (f,).
 
     It reaches ``margin`` (s) beyond the first and last frame of each stretch.
 
@@ -53,7 +53,7 @@ def spline_through(
     parts: list[IntArray], times: Array, rotations: Array, positions: Array, spacing: float,
     margin: float,
 ) -> Spline:  # fmt: skip
-    """A spline near poses, as :func:`first_spline`, with a stretch for each part (indices)."""
+    """Return a spline near poses, as :func:`first_spline`, with a stretch per part (indices)."""
     intervals = np.array([[times[part[0]] - margin, times[part[-1]] + margin] for part in parts])
     layout = Layout.over(intervals, spacing)
     controls = layout.control_times()
@@ -75,7 +75,7 @@ def spline_through(
 
 
 def refined(spline: Spline, spacing: float, intervals: Array | None = None) -> Spline:
-    """The same motion with other knots, over all of it or over parts (s,2) of its time.
+    """Return the same motion with other knots, over all or over parts (s,2) of its time.
 
     At a knot the curve lies a sixth of the controls' second difference beside its control; where
     the new knots are among the old ones, or between them, the motion stays exactly the same.
@@ -117,7 +117,7 @@ class Layout:
 
     @staticmethod
     def over(intervals: Array, spacing: float) -> Layout:
-        """Knots that cover time intervals (s,2)."""
+        """Return knots that cover time intervals (s,2)."""
         spans = np.ceil((intervals[:, 1] - intervals[:, 0]) / spacing - 1e-9).astype(np.int64)
         spans = np.maximum(spans, 1)
         middles = 0.5 * (intervals[:, 0] + intervals[:, 1])
@@ -131,12 +131,12 @@ class Layout:
         return ends
 
     def alone(self) -> IntArray:
-        """The second controls (k,) of stretches of one interval, which lies behind them."""
+        """Return the second controls (k,) of stretches of one interval, which lies behind them."""
         seconds: IntArray = 1 + self.firsts[:-1][np.diff(self.firsts) == ORDER]
         return seconds
 
     def control_times(self) -> Array:
-        """Times (n,) at which the controls weigh most, s."""
+        """Return the times (n,) at which the controls weigh most, s."""
         parts = [
             start + self.spacing * (np.arange(count) - 1.0)
             for start, count in zip(self.starts, np.diff(self.firsts), strict=True)
@@ -144,7 +144,7 @@ class Layout:
         return np.concatenate(parts)
 
     def stretches(self, times: Array) -> IntArray:
-        """The stretch (m,) of each time; that nearest to it where it lies in none."""
+        """Return the stretch (m,) of each time; the nearest one if it lies in none."""
         after = np.clip(np.searchsorted(self.starts, times, side="right"), 1, len(self.starts))
         index = after - 1
         following = np.minimum(after, len(self.starts) - 1)
@@ -152,12 +152,12 @@ class Layout:
         return np.where(nearer & (times > self.ends[index]), following, index)
 
     def inside(self, times: Array) -> BoolArray:
-        """Which times (m,) a stretch covers."""
+        """Return a mask (m,) of times that a stretch covers."""
         index = self.stretches(times)
         return (times >= self.starts[index]) & (times <= self.ends[index])
 
     def locate(self, times: Array) -> tuple[IntArray, Array]:
-        """First of the four controls (m,) that act at times (m,), and the place (m,) ``u``.
+        """Return the first of four controls (m,) at times (m,), and the place (m,) ``u``.
 
         Times outside of the stretches are taken for the nearest covered one.
         """
@@ -183,19 +183,19 @@ class Spline:
             object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name)))
 
     def moved(self, step: Array) -> Spline:
-        """With the controls changed by a step (6 n,)."""
+        """Return the spline with the controls changed by a step (6 n,)."""
         step = step.reshape(-1, 6)
         rotations = self.rotations @ so3.exp_many(step[:, :3])
         return Spline(self.layout, rotations, self.positions + step[:, 3:])
 
     def steps(self) -> tuple[Array, Array]:
-        """Rotation vectors (n,3) from control to control, and inverse right Jacobians (n,3,3)."""
+        """Return rotation vectors (n,3) between controls, and inverse right Jacobians (n,3,3)."""
         vectors, inverses = np.zeros((len(self.rotations), 3)), np.zeros_like(self.rotations)
         steps(self.rotations, vectors, inverses)
         return vectors, inverses
 
     def states(self, times: Array) -> States:
-        """Pose, velocities and accelerations at times (m,), s."""
+        """Return pose, velocities and accelerations at times (m,), s."""
         first, u = self.layout.locate(times)
         vectors, _ = self.steps()
         m = len(first)
@@ -210,7 +210,7 @@ class Spline:
         )
 
     def jacobians(self, times: Array) -> tuple[IntArray, Array]:
-        """First controls (m,), and derivatives (m,12,24) by four controls of the state at times.
+        """Return first controls (m,), and derivatives (m,12,24) of the states by four controls.
 
         The rows: turn of the camera in its own axes, position in the map, body rate (rad/s),
         velocity in the map (m/s).

@@ -30,7 +30,7 @@ LOCAL = ORDER * CONTROL
 
 @kernel
 def cumulative(u: float, order: int, out: Array) -> None:
-    """The cumulative basis l_1, l_2, l_3 (or its derivative of this order by u)."""
+    """Write the cumulative basis l_1, l_2, l_3 (or its derivative of this order by u)."""
     if order == 0:
         out[0] = (5.0 + u * (3.0 - u * (3.0 - u))) / 6.0
         out[1] = (1.0 + u * (3.0 + u * (3.0 - 2.0 * u))) / 6.0
@@ -47,7 +47,7 @@ def cumulative(u: float, order: int, out: Array) -> None:
 
 @kernel
 def product(a: Array, b: Array, out: Array) -> None:
-    """``out = a b`` of (3,3) matrices."""
+    """Multiply (3,3) matrices: ``out = a b``."""
     for i in range(3):
         for j in range(3):
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
@@ -55,7 +55,7 @@ def product(a: Array, b: Array, out: Array) -> None:
 
 @inlined
 def turn(vector: Array, scale: float, rotation: Array, jacobian: Array) -> None:
-    """``exp(scale v)`` and ``scale`` times the right Jacobian of the exponential there."""
+    """Write ``exp(scale v)`` and ``scale`` times the right Jacobian of the exponential there."""
     x, y, z = scale * vector[0], scale * vector[1], scale * vector[2]
     first, second, third = coefficients(x * x + y * y + z * z)
     xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
@@ -78,7 +78,7 @@ def turn(vector: Array, scale: float, rotation: Array, jacobian: Array) -> None:
 
 @inlined
 def inverse_right_jacobian(v: Array, out: Array) -> None:
-    """Inverse of the right Jacobian of the exponential at a rotation vector.
+    """Write the inverse of the right Jacobian of the exponential at a rotation vector.
 
     Its transpose is that of the left one.
     """
@@ -99,7 +99,7 @@ def inverse_right_jacobian(v: Array, out: Array) -> None:
 
 @entry
 def steps(rotations: Array3, vectors: Out[Array2], inverses: Out[Array3]) -> None:
-    """From control to control: rotation vectors (n,3) and inverse right Jacobians (n,3,3).
+    """Write rotation vectors (n,3) between controls and inverse right Jacobians (n,3,3).
 
     Row k leads from control k - 1 to k; row 0 stays as it is.
     """
@@ -120,7 +120,7 @@ def pose(
     rotations: Array, positions: Array, vectors: Array, first: int, u: float, work: Array,
     rotation: Array, position: Array,
 ) -> None:  # fmt: skip
-    """Pose at ``u`` behind control ``first``; ``work`` (8,3,3) keeps turns and Jacobians.
+    """Write the pose at ``u`` behind control ``first``; ``work`` (8,3,3) keeps intermediates.
 
     The basis of the positions is in ``work[7, 0:2]``.
     """
@@ -144,7 +144,7 @@ def rates(
     positions: Array, vectors: Array, first: int, u: float, spacing: float, work: Array,
     rotation: Array, out: Array,
 ) -> None:  # fmt: skip
-    """Rows of ``out`` (4,3): body rate, velocity in the map, and their derivatives by time.
+    """Write rows of ``out`` (4,3): body rate, velocity in the map, and their derivatives.
 
     ``work`` and ``rotation`` as :func:`pose` left them.
     """
@@ -184,7 +184,7 @@ def rates(
 
 @kernel
 def pull_back(row: Array, inverses: Array, first: int, work: Array, out: Array) -> None:
-    """Derivative by the four controls' turns of what changes by ``row`` (3,) per turn.
+    """Write the derivative by four controls' rotations of what changes by ``row`` (3,).
 
     Into ``out[0:3], out[6:9], ...``, of body-axes turns. ``work`` as :func:`pose` left it.
     """
@@ -216,7 +216,7 @@ def states(
     spacing: float,
     out_rotations: Out[Array3], out_positions: Out[Array2], out_rates: Out[Array3],
 ) -> None:  # fmt: skip
-    """Poses and rates (as :func:`rates`) at many places."""
+    """Write poses and rates (as :func:`rates`) at many places."""
     work = np.empty((8, 3, 3))
     for k in range(len(first)):
         pose(
@@ -231,7 +231,7 @@ def jacobians(
     u: Array1,
     spacing: float, out: Out[Array3],
 ) -> None:  # fmt: skip
-    """Derivatives (m,12,24) of turn, position, body rate and velocity by the four controls."""
+    """Write derivatives (m,12,24) of rotation, position, rate, velocity by the controls."""
     work, rotation, position = np.empty((8, 3, 3)), np.empty((3, 3)), np.empty(3)
     unit, weights, slopes = np.zeros(3), np.empty(3), np.empty(3)
     rate, carried = np.empty(3), np.empty(3)

@@ -58,7 +58,7 @@ class Rows(NamedTuple):
     cost: float  # sum of squares, or of what a robust loss makes of them
 
     def matrix(self, part: slice, width: int) -> csr_array:
-        """A part of the derivatives (m r,width) by the first unknowns."""
+        """Return a part of the derivatives (m r,width) by the first unknowns."""
         some = self._replace(
             values=self.values[part], first=self.first[part], others=self.others[part]
         )
@@ -163,7 +163,7 @@ def _run(rows: Rows) -> int:
 
 
 def _sparse(rows: Rows, width: int) -> csr_array:
-    """Derivatives (n r,width) by the first unknowns."""
+    """Return derivatives (n r,width) by the first unknowns."""
     columns = np.concatenate([rows.first[:, None] + np.arange(_run(rows)), rows.others], axis=1)
     absent = (columns < 0) | (columns >= width)
     values = np.where(absent[:, None], 0.0, rows.values)
@@ -174,7 +174,7 @@ def _sparse(rows: Rows, width: int) -> csr_array:
 
 
 def _eliminated(groups: Groups, rows: Sequence[Rows]) -> _Blocks:
-    """Blocks of the rows that have one each, or none."""
+    """Return the blocks of the rows that have one each, or none."""
     count, width, kept = groups.blocks, groups.width, groups.kept
     with_block = [term for term in rows if np.any(term.others >= kept)]
     whole = vstack([_sparse(term, kept + count * width) for term in with_block]).tocsc()
@@ -188,7 +188,7 @@ def _eliminated(groups: Groups, rows: Sequence[Rows]) -> _Blocks:
 
 
 def _reach(blocks: _Blocks, motion: int) -> int:
-    """Width of the band that the motion has without the blocks."""
+    """Return the width of the band that the motion has without the blocks."""
     own = csc_array(blocks.coupled[:motion])
     own.sort_indices()
     firsts, ends = own.indptr[:-1], own.indptr[1:]
@@ -270,7 +270,7 @@ class Factored:
         return np.asarray(scale * cho_solve(self._schur, scale * right))
 
     def kept(self, right: Array) -> Array:
-        """Solutions (N,q) of the reduced system."""
+        """Return the solutions (N,q) of the reduced system."""
         if self.system.dense:
             return np.asarray(cho_solve(self._whole, right, check_finite=False))
         own, shared = np.split(right, [self.system.groups.motion])
@@ -279,7 +279,7 @@ class Factored:
         return np.concatenate([inner - self._lifted @ border, border])
 
     def solve(self, right: Array, of_blocks: Array) -> tuple[Array, Array]:
-        """Solutions (N,q) and of the blocks (b,w,q), for right sides of these shapes."""
+        """Return solutions (N,q) and of the blocks (b,w,q), for right sides of these shapes."""
         blocks, count = self.system.blocks, right.shape[1]
         assert blocks is not None
         own = self._inverses @ of_blocks
@@ -288,7 +288,7 @@ class Factored:
         return found, own - self._inverses @ back
 
     def step(self) -> Array:
-        """The step of all unknowns in their order."""
+        """Return the step of all unknowns in their order."""
         right, blocks = -self.system.slope[:, None], self.system.blocks
         if blocks is None:
             return self.kept(right)[:, 0]
@@ -297,7 +297,7 @@ class Factored:
         return np.concatenate([kept[:, 0], others.ravel()])
 
     def border_covariance(self) -> Array:
-        """Covariance (b,b) of the border, all else marginalised."""
+        """Return the covariance (b,b) of the border, all else marginalized."""
         groups = self.system.groups
         if not self.system.dense:
             return self._solve_schur(np.eye(groups.border))
@@ -306,7 +306,7 @@ class Factored:
         return self.kept(unit)[groups.motion :]
 
     def block_covariances(self) -> tuple[Array, Array]:
-        """Covariances of each block (b,w,w) and of the border (b,b); a dense factor is used up."""
+        """Return covariances of blocks (b,w,w) and border (b,b); uses up a dense factor."""
         blocks, motion = self.system.blocks, self.system.groups.motion
         assert blocks is not None
         assert self.system.dense
@@ -331,7 +331,7 @@ class Factored:
         return np.asarray(out), part(np.arange(motion, len(inverse)))
 
     def modes(self, count: int) -> Array:
-        """Independent errors (N,count) of the kept unknowns, one deviation of each.
+        """Return independent errors (N,count) of the kept unknowns, one deviation of each.
 
         All N of them have the covariance ``S^-1``; these are the ones by which blocks that know
         nothing else of each other move the most, in their own deviations: the eigenvectors of
@@ -361,7 +361,7 @@ class Factored:
         return np.asarray(modes[:, ::-1])
 
     def local_covariances(self, firsts: IntArray) -> Array:
-        """Covariances (m,24,24) of the four controls from each of ``firsts`` (m,) on.
+        """Return covariances (m,24,24) of four controls from each of ``firsts`` (m,) on.
 
         From the blocks on and beside the diagonal of the inverse of the band (a recursion from
         its end to its beginning), and from the border's covariance.
@@ -387,7 +387,7 @@ class Factored:
         return out
 
     def _inverse_blocks(self, size: int) -> tuple[Array, Array]:
-        """Blocks (k,s,s) on the diagonal of H^-1, and those to their right."""
+        """Return the blocks (k,s,s) on the diagonal of H^-1, and those to their right."""
         band, count = self._band, self.system.groups.motion
         blocks = -(-count // size)
         lower, below = np.zeros((2, blocks, size, size))  # and L of the next block by this one

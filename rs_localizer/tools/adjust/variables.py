@@ -29,12 +29,12 @@ class GyroSamples:
     deviation: float = np.inf  # rad/s, standard deviation of the noise of a sample and axis
 
     def covered(self, layout: Layout, delay: float, margin: float) -> BoolArray:
-        """Which samples (k,) a motion covers, and its edges are farther away than ``margin`` s."""
+        """Return a mask (k,) of samples that a motion covers, ``margin`` s off its edges."""
         times = self.times + delay
         return layout.inside(times - margin) & layout.inside(times + margin)
 
     def subset(self, chosen: BoolArray) -> GyroSamples:
-        """The chosen samples (k,)."""
+        """Return the chosen samples (k,)."""
         return GyroSamples(self.times[chosen], self.rates[chosen], self.deviation)
 
 
@@ -61,20 +61,20 @@ class GyroMount:
         return matrix
 
     def moved(self, step: Array) -> GyroMount:
-        """After a step (13,)."""
+        """Return the mount after a step (13,)."""
         return GyroMount(
             self.camera_from_imu @ so3.exp(step[:3]), self.bias + step[3:6],
             self.delay + float(step[DELAY]), self.shape + step[DELAY + 1 :],
         )  # fmt: skip
 
     def beside(self, first: GyroMount) -> Array:
-        """The step (13,) that leads here from a first guess, which has no shape."""
+        """Return the step (13,) that leads here from a first guess, which has no shape."""
         turn = so3.log(np.ascontiguousarray(first.camera_from_imu.T @ self.camera_from_imu))
         step: Array = np.r_[turn, self.bias - first.bias, self.delay - first.delay, self.shape]
         return step
 
     def turned_from(self, given: Array) -> float:
-        """Angle (rad) between its rotation and a given one (3,3)."""
+        """Return the angle (rad) between its rotation and a given one (3,3)."""
         between = np.ascontiguousarray(given.T @ self.camera_from_imu)
         return float(np.linalg.norm(so3.log(between)))
 
@@ -95,7 +95,7 @@ class SplineKeypoints:
     bodies: IntArray | None = None
 
     def subset(self, chosen: BoolArray) -> SplineKeypoints:
-        """The chosen keypoints (n,), with all landmarks."""
+        """Return the chosen keypoints (n,), with all landmarks."""
         names = ("times", "row_times", "pixels", "points", "frames", "trusted")
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
@@ -110,16 +110,16 @@ class Extrinsics:
 
     @classmethod
     def none(cls) -> Extrinsics:
-        """Extrinsics of a camera whose axes are the rig's."""
+        """Return the extrinsics of a camera whose axes are the rig's."""
         return cls(np.eye(3), np.zeros(3), 0.0)
 
     def moved(self, step: Array) -> Extrinsics:
-        """After a step (7,): turn in camera axes, centre, offset."""
+        """Return the extrinsics after a step (7,): rotation in camera axes, centre, offset."""
         turned = so3.exp(np.ascontiguousarray(step[:3])) @ self.axes
         return Extrinsics(turned, self.centre + step[3:6], self.offset + float(step[6]))
 
     def beside(self, other: Extrinsics) -> Array:
-        """The step (7,) that leads here from others."""
+        """Return the step (7,) that leads here from others."""
         turn = so3.log(np.ascontiguousarray(self.axes @ other.axes.T))
         step: Array = np.r_[turn, self.centre - other.centre, self.offset - other.offset]
         return step
@@ -169,7 +169,7 @@ class CameraView:
     freedom: Freedom
 
     def subset(self, chosen: BoolArray) -> CameraView:
-        """With the chosen keypoints (n,)."""
+        """Return the view with the chosen keypoints (n,)."""
         return replace(self, observations=self.observations.subset(chosen))
 
 
@@ -189,7 +189,7 @@ class Unknowns:
     others: tuple[Unknowns, ...] = ()
 
     def with_landmarks(self, landmarks: Array) -> Unknowns:
-        """With the same landmarks (p,3) for all cameras."""
+        """Return the unknowns with the same landmarks (p,3) for all cameras."""
         others = tuple(replace(one, landmarks=landmarks) for one in self.others)
         return replace(self, landmarks=landmarks, others=others)
 
@@ -197,7 +197,7 @@ class Unknowns:
 def start_state(
     camera: Camera, observations: SplineKeypoints, spline: Spline, readout_time: float = 0.0
 ) -> Unknowns:
-    """A first guess with the camera's own lens and the map as it is given."""
+    """Return a first guess with the camera's own lens and the map as it is given."""
     delays = np.zeros(int(observations.frames.max(initial=-1)) + 1)
     return Unknowns(
         spline, readout_time, lens_values(camera), observations.landmarks.copy(), delays
@@ -207,7 +207,7 @@ def start_state(
 def rig_state(
     spline: Spline, cameras: Iterable[tuple[Camera, SplineKeypoints, Extrinsics]]
 ) -> Unknowns:
-    """A first guess of cameras on what moves, with their own readout times and clocks."""
+    """Return a first guess of cameras on one body, with their own readout times and clocks."""
     first, *others = (
         replace(start_state(camera, seen, spline, camera.readout_time), extrinsics=mounted)
         for camera, seen, mounted in cameras

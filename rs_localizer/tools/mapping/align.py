@@ -25,7 +25,7 @@ def alignment(
     up: tuple[float, float, float] | None = None, floor: Sequence[int] = (),
     origin: int | None = None,
 ) -> Similarity:  # fmt: skip
-    """The similarity that brings a map to where it is wanted.
+    """Return the similarity that brings a map to where it is wanted.
 
     Args:
         scale: factor.
@@ -66,7 +66,7 @@ def alignment(
 
 
 def _normal(floor: Array, points: Array) -> Array:
-    """Upward normal of a floor (n,3) that all other points (p,3) are above of."""
+    """Return the normal of a floor (n,3), towards the side of all other points (p,3)."""
     if len(floor) < _LEAST_FLOOR:
         raise ValueError(f"a floor needs at least {_LEAST_FLOOR} ids, got {len(floor)}")
     middle = floor.mean(axis=0)
@@ -78,7 +78,7 @@ def _normal(floor: Array, points: Array) -> Array:
 
 
 def moved(any_map: Map | MarkerMap, by: Similarity) -> Map | MarkerMap:
-    """A map after a similarity, which changes the markers' sizes with the scale.
+    """Move a map by a similarity, which changes the markers' sizes with the scale.
 
     Raises:
         ValueError: when boards would change their size.

@@ -71,7 +71,7 @@ class Anchors:
         return self.corners + len(self.names)
 
     def seen(self, views: Sequence[SeenImage]) -> tuple[IntArray, IntArray, Array]:
-        """Views (n,), anchors (n,) and pixels (n,2) of all sights."""
+        """Return views (n,), anchors (n,) and pixels (n,2) of all sights."""
         names = self.names
         every = [
             (row, corner, pixel)
@@ -98,7 +98,7 @@ class Placement:
 def placement(
     anchors: Anchors, triangulated: Triangulated, rotations: Array, positions: Array
 ) -> Placement:
-    """The frame of the map in metres.
+    """Return the frame of the map in metres.
 
     Args:
         anchors: what is known.
@@ -147,7 +147,7 @@ def _row(anchors: Anchors, name: str) -> int:
 
 
 def determined_corners(marker_map: MarkerMap, triangulated: Triangulated) -> BoolArray:
-    """Which corners (c,) of the map hold it: those that three images or more see."""
+    """Return a mask (c,) of the map's corners that three images or more see."""
     count = len(marker_map.points)
     places, counts = triangulated.points[:count], triangulated.counts[:count]
     determined: BoolArray = np.isfinite(places).all(axis=1) & (counts > 2)
@@ -185,7 +185,7 @@ def _by_markers(marker_map: MarkerMap, triangulated: Triangulated) -> Placement:
 
 
 def _down(rotations: Array) -> Array:
-    """The direction most often at right angles to the images' rows: people hold cameras level.
+    """Return the direction most often at right angles to image rows: cameras are held level.
 
     Its sign is that of the images' mean downward direction.
     """
@@ -209,7 +209,7 @@ def marker_constraints(
     corners: MapObservations,
     places: Array,
 ) -> tuple[MapObservations, Start, Array | None]:
-    """Inputs with the corners of markers, in their frame; without, if too few are seen.
+    """Return inputs with corners of markers, in their frame; without, if too few are seen.
 
     With the deviations (p,) of all landmarks, m; None: without corners.
 

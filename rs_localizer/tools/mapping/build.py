@@ -102,7 +102,7 @@ class ViewMotion:
     refined: RefinedMap
 
     def sights(self, views: IntArray, landmarks: IntArray, pixels: Array) -> Sights:
-        """Keypoints (n,) of those views that have a pose, with that at the time of their rows."""
+        """Return keypoints (n,) of the views with a pose, with their pose at the row's time."""
         place = np.minimum(np.searchsorted(self.rows, views), len(self.rows) - 1)
         known = self.rows[place] == views
         at, pixels = place[known], pixels[known]
@@ -112,7 +112,7 @@ class ViewMotion:
         return Sights(states.rotations, states.positions, pixels, landmarks[known])
 
     def moves(self, seen: tuple[IntArray, IntArray, Array], triangulated: Triangulated) -> Array:
-        """How a deviation of each error of the motion moves points (p,3,k) triangulated so."""
+        """Return how a deviation of each motion error moves triangulated points (p,3,k)."""
         others = [replace(self, refined=drift) for drift in self.refined.drifts]
         by_drift = moves(
             self.refined.camera, self.sights(*seen), triangulated,
@@ -140,7 +140,7 @@ class Built:
     positions: Array  # (g,3)
 
     def middle_rows(self, stamps_ns: Sequence[int]) -> tuple[IntArray, Array, Array]:
-        """Times (g,) ns of the middle rows, positions (g,3), quaternions (g,4) of the poses.
+        """Return times (g,) ns, positions (g,3) and quaternions (g,4) at the middle rows.
 
         Args:
             stamps_ns: of all views.
@@ -206,7 +206,7 @@ def build_map(inputs: Given, work: Workshop) -> Built:
 
 
 def _structure(inputs: Given, keyframes: IntArray, work: Workshop) -> Structure:
-    """The first structure, of about the right size."""
+    """Return the first structure, of about the right size."""
     stamps = {row: inputs.views[row].stamp_ns for row in keyframes.tolist()}
     structure = build_structure(
         inputs.views[0].image.parent, stamps, inputs.camera, work.folder, work.effort, work.stage,
@@ -223,14 +223,14 @@ def _structure(inputs: Given, keyframes: IntArray, work: Workshop) -> Structure:
 
 
 def usual_size(seen: MapObservations, start: Start) -> Similarity:
-    """Larger, as a room is: priors of motions are in metres."""
+    """Return the similarity to the size of a room: priors of motions are in metres."""
     return scaled(USUAL_DISTANCE / float(np.median(np.linalg.norm(start.local(seen), axis=1))))
 
 
 def _refined(
     inputs: Given, observations: MapObservations, start: Start, camera: Camera, work: Workshop
 ) -> tuple[RefinedMap, ShutterFit | None, ReadoutCheck | None]:
-    """The refined map; a shutter that was unknown or wrong; check of a given one."""
+    """Return the refined map, a shutter that was unknown or wrong, the check of a given one."""
     freedom = colmap_freedom(observations, start, inputs.camera is None)
     freedom = replace(freedom, drifts=_MODES)
     if inputs.anchors.marker_map is not None:
@@ -248,7 +248,7 @@ def _refined(
 
 
 def _corners(inputs: Given, stamps_ns: IntArray) -> MapObservations:
-    """Corners of markers in the images with these stamps."""
+    """Return corners of markers in the images with these stamps."""
     views, corners, pixels = inputs.anchors.seen(inputs.views)
     stamps = inputs.stamps_ns[views]
     images = np.minimum(np.searchsorted(stamps_ns, stamps), len(stamps_ns) - 1)
@@ -257,7 +257,7 @@ def _corners(inputs: Given, stamps_ns: IntArray) -> MapObservations:
 
 
 def check_fit(share: float, focal_length: float | None) -> None:
-    """Images too far apart leave the motion between them open, and the map may follow it.
+    """Refuse images too far apart: they leave the motion open, and the map may follow it.
 
     Args:
         share: of the keypoints that fit.
@@ -280,7 +280,7 @@ def check_fit(share: float, focal_length: float | None) -> None:
 
 
 def _kept(triangulated: Triangulated, motion: ViewMotion) -> IntArray:
-    """Rows of the points that are good enough to be landmarks."""
+    """Return rows of the points that are good enough to be landmarks."""
     _, positions = motion.refined.poses()
     away = np.linalg.norm(triangulated.points - np.median(positions, axis=0), axis=1)
     good = triangulated.counts >= _LEAST_SIGHTS

@@ -38,27 +38,27 @@ class Similarity:
     translation: Array  # (3,)
 
     def __call__(self, points: Array) -> Array:
-        """Points (n,3) in the other frame."""
+        """Transform points (n,3) to the other frame."""
         moved: Array = self.scale * points @ self.rotation.T + self.translation
         return moved
 
     def moved(self, spline: Spline) -> Spline:
-        """A motion, as it is in the other frame."""
+        """Transform a motion to the other frame."""
         return Spline(spline.layout, self.rotation @ spline.rotations, self(spline.positions))
 
     def covariances(self, before: Array) -> Array:
-        """Covariances of points (n,3,3) in the other frame."""
+        """Transform covariances of points (n,3,3) to the other frame."""
         after: Array = self.scale**2 * self.rotation @ before @ self.rotation.T
         return after
 
 
 def scaled(factor: float) -> Similarity:
-    """Everything becomes larger about the origin."""
+    """Return the similarity that enlarges everything about the origin."""
     return Similarity(factor, np.eye(3), np.zeros(3))
 
 
 def through(points: Array, there: Array) -> Similarity:
-    """The similarity that brings points (n,3) to places (n,3), with the least squared distances.
+    """Return the similarity from points (n,3) to places (n,3) with the least squared distances.
 
     S. Umeyama, Least-squares estimation of transformation parameters between two point patterns,
     PAMI 1991.
@@ -80,7 +80,7 @@ def through(points: Array, there: Array) -> Similarity:
 
 
 def upright(down: Array) -> Array:
-    """The rotation (3,3) that turns a direction (3,) by the shortest way to ``-z``."""
+    """Return the rotation (3,3) of a direction (3,) by the shortest way to ``-z``."""
     return np.asarray(Rotation.align_vectors([0.0, 0.0, -1.0], down)[0].as_matrix())
 
 
@@ -88,7 +88,7 @@ _ROUNDS, _OUTLIERS = 5, 4.0
 
 
 def laid_over(points: Array, onto: Array, usable: BoolArray) -> tuple[Similarity, BoolArray]:
-    """The similarity of the landmarks that hardly changed, and which (n,) these are."""
+    """Return the similarity of the landmarks that hardly changed, and their mask (n,)."""
     kept = usable
     similarity = through(points[kept], onto[kept])
     for _ in range(_ROUNDS):
@@ -99,7 +99,7 @@ def laid_over(points: Array, onto: Array, usable: BoolArray) -> tuple[Similarity
 
 
 def generators(points: Array, middle: Array) -> Array:
-    """How points (n,3) move with shift, turn and size of the whole about a middle: (n,3,7)."""
+    """Return moves (n,3,7) of points by shift, rotation and size of the whole about a middle."""
     arms = points - middle
     motions = np.zeros((len(points), 3, 7))
     motions[:, :, :3] = np.eye(3)
@@ -109,7 +109,7 @@ def generators(points: Array, middle: Array) -> Array:
 
 
 def as_held(covariances: Array, spread: Array, every: Array, of_kept: Array) -> Array:
-    """Covariances (n,3,3) of points when the kept ones hold the whole.
+    """Return covariances (n,3,3) of points if the kept ones hold the whole.
 
     Args:
         covariances: in another gauge.
@@ -129,7 +129,7 @@ def as_held(covariances: Array, spread: Array, every: Array, of_kept: Array) -> 
 
 
 def laid_on_held(points: Array, moves: Array, held: Triangulated, by: Array) -> Array:
-    """Moves (n,3,k) of points (n,3) when the whole is laid back by others that hold it.
+    """Return moves (n,3,k) of points if the whole is laid back by others that hold it.
 
     Args:
         held: the others, which count as they are known.
@@ -143,7 +143,7 @@ def laid_on_held(points: Array, moves: Array, held: Triangulated, by: Array) -> 
 
 
 def of_the_shape(covariance: Array, corners: Array) -> Array:
-    """Covariance (6 m, 6 m) of places and turns (along the map's axes) when all corners hold it.
+    """Return the covariance (6 m, 6 m) of positions and rotations if all corners hold it.
 
     Of all rigid motions that lay them over the truth, the best is the identity.
 

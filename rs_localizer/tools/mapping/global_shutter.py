@@ -1,10 +1,11 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A model of COLMAP as a global shutter would have given it, for programs that know no other one.
+"""A model of COLMAP as of a global shutter, for programs that know no other shutter.
 
-Motion and the most useful points are adjusted with the rolling shutter, all points are triangulated
-with that motion, and each keypoint is moved to where a camera at the pose of one row of its image
-has the same point: along its own ray, to the depth of the point. The noise of a keypoint stays.
+Motion and the most useful points are adjusted with the rolling shutter, and all points are
+triangulated with that motion. Each keypoint is then moved to the place where a camera at the pose
+of one row of its image has the same point, along its own ray, to the depth of the point. The noise
+of a keypoint stays.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ def undo_shutter(
     lens: bool,
     done: Callable[[str], object] = lambda text: None,
 ) -> GlobalShutterModel:
-    """The model that a global shutter would have given.
+    """Return the model that a global shutter would have given.
 
     Args:
         camera: of all images; its shutter does not matter.
@@ -132,6 +133,6 @@ def undo_shutter(
 
 
 def _moved(poses: tuple[Array, Array], points: Array) -> Array:
-    """Points (n,3) in cameras (n)."""
+    """Transform points (n,3) to cameras (n)."""
     moved: Array = np.einsum("nij,nj->ni", poses[0], points) + poses[1]
     return moved

@@ -28,7 +28,7 @@ ANGULAR_VELOCITY, LINEAR_VELOCITY = 2.0, 1.0
 
 
 def following(times: Array, rotations: Array) -> BoolArray:
-    """Which images (g - 1,) follow the one before them in one motion."""
+    """Return a mask (g - 1,) of images that follow the one before in one motion."""
     turns = Rotation.from_matrix(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:])
     return np.asarray((np.diff(times) <= LONGEST_GAP) & (turns.magnitude() < _MOST_TURN), np.bool_)
 
@@ -37,7 +37,7 @@ def initial_trajectory(
     times: Array, rotations: Array, positions: Array, readout_time: float,
     follow: BoolArray | None = None,
 ) -> Spline:  # fmt: skip
-    """A spline near poses (g,3,3), (g,3), map_from_camera, at rising times (g,), s.
+    """Return a spline near poses (g,3,3), (g,3), map_from_camera, at rising times (g,), s.
 
     Images that follow each other (g - 1,) are one stretch (None: those that are near in time); one
     that stands alone has a piece of its own.
@@ -54,7 +54,7 @@ def initial_trajectory(
 
 
 def usual_accelerations(times: Array, rotations: Array, positions: Array) -> tuple[float, float]:
-    """Accelerations of images (g,) in a row, rms: rad/s^2, m/s^2 (0: no three are)."""
+    """Return rms accelerations of successive images (g,): rad/s^2, m/s^2, or 0."""
     steps = np.diff(times)
     follow = following(times, rotations)
     near = follow[1:] & follow[:-1]
@@ -72,7 +72,7 @@ def usual_accelerations(times: Array, rotations: Array, positions: Array) -> tup
 
 
 def acceleration_prior(state: Unknowns, freedom: Freedom) -> Freedom | None:
-    """With a prior of the accelerations as large as the motion's own, where stretches suffice."""
+    """Return a prior of accelerations as large as the motion's own, if stretches suffice."""
     layout = state.spline.layout
     counts = np.diff(layout.firsts)
     long = np.repeat(counts >= _LEAST_IMAGES, counts)

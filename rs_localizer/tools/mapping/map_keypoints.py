@@ -73,7 +73,7 @@ class RigImages(NamedTuple):
 
 
 def frames_of(times: Sequence[Array]) -> list[RigImages]:
-    """Which images belong together, by the times (g,), s, of each camera's."""
+    """Group images by the times (g,), s, of each camera's."""
     every = sorted(
         (float(time), camera, image)
         for camera, own in enumerate(times)
@@ -93,7 +93,7 @@ def frames_of(times: Sequence[Array]) -> list[RigImages]:
 
 
 def frame_numbers(times: Array, cameras: IntArray) -> IntArray:
-    """The frame of each image (g,), by its time (s) and its camera."""
+    """Return the frame of each image (g,), by its time (s) and its camera."""
     own = [np.flatnonzero(cameras == camera) for camera in range(int(cameras.max()) + 1)]
     numbers = np.empty(len(times), np.int64)
     for number, frame in enumerate(frames_of([times[images] for images in own])):
@@ -145,11 +145,11 @@ class Start:
     positions: Array  # (g,3) m, of the camera's centre in the map
 
     def moved(self, by: Similarity) -> Start:
-        """The same in another frame."""
+        """Transform the first guess to another frame."""
         return Start(by(self.points), by.rotation @ self.rotations, by(self.positions))
 
     def local(self, seen: MapObservations) -> Array:
-        """The landmarks of keypoints (n,3) in camera axes, as of a global shutter."""
+        """Return the landmarks of keypoints (n,3) in camera axes, as of a global shutter."""
         away = self.points[seen.landmarks] - self.positions[seen.images]
         return np.asarray(np.einsum("nji,nj->ni", self.rotations[seen.images], away))
 
@@ -170,7 +170,7 @@ class MapFreedom:
 
 
 def shared_landmarks(observations: MapObservations) -> BoolArray:
-    """Which landmarks (up to the last one that is seen) two images or more see."""
+    """Return a mask of landmarks (up to the last seen one) that two images or more see."""
     pairs = np.unique(np.column_stack([observations.landmarks, observations.images]), axis=0)
     return np.bincount(pairs[:, 0]) > 1
 
@@ -206,7 +206,7 @@ def check(observations: MapObservations, points: int, delays: Array) -> None:
 
 
 def _parts(observations: MapObservations, usable: BoolArray, frames: IntArray) -> list[int]:
-    """Numbers of images, or of a rig's frames, that hang together, largest first."""
+    """Number the connected parts of images, or of a rig's frames, largest first."""
     images, landmarks = frames[observations.images[usable]], observations.landmarks[usable]
     ones = np.ones(len(images))
     sees = coo_array((ones, (images, landmarks))).tocsr()
@@ -220,7 +220,7 @@ def _parts(observations: MapObservations, usable: BoolArray, frames: IntArray) -
 
 
 def most_observed(landmarks: IntArray, images: IntArray, wanted: int) -> BoolArray:
-    """Which landmarks to adjust: the most observed, more if half of an image needs them.
+    """Return a mask of the most observed landmarks; more, if half of an image needs them.
 
     Args:
         landmarks, images: (n,) of each keypoint.
@@ -244,7 +244,7 @@ def most_observed(landmarks: IntArray, images: IntArray, wanted: int) -> BoolArr
 def adjusted_part(
     seen: MapObservations, start: Start, wanted: int, least: int = 1
 ) -> tuple[IntArray, MapObservations, Start]:
-    """Images (k,) that show the most observed landmarks, and what they show of these.
+    """Return images (k,) with the most observed landmarks, and what they show of these.
 
     Args:
         wanted: keypoints of each image.
@@ -278,7 +278,7 @@ def from_recordings(
     cameras: Sequence[Camera], clouds: Sequence[Sequence[Correspondences]],
     landmarks: Map | None = None, done: Callable[[], object] = lambda: None,
 ) -> RecordedMap:  # fmt: skip
-    """Images with a pose, and the landmarks that they show.
+    """Return images with a pose, and the landmarks that they show.
 
     Args:
         cameras: of a rig, or one alone, with their readout times, where these are known.
@@ -326,7 +326,7 @@ def from_recordings(
 
 
 def _own_map(clouds: Sequence[Correspondences]) -> Map:
-    """The points of all clouds, with their ids if they have any."""
+    """Return the points of all clouds, with their ids if they have any."""
     points = np.concatenate([cloud.points for cloud in clouds])
     ids = None
     if all("id" in (cloud.table.dtype.names or ()) for cloud in clouds):
@@ -339,7 +339,7 @@ def _own_map(clouds: Sequence[Correspondences]) -> Map:
 
 
 def _rows_of(landmarks: Map, cloud: Correspondences) -> IntArray:
-    """The landmarks (n,) that the rows of a cloud show: by their ids, else by their places."""
+    """Return the landmarks (n,) of the rows of a cloud, by their ids, else by their places."""
     names = cloud.table.dtype.names or ()
     if landmarks.ids is not None and "id" in names:
         wanted: NDArray[Any] = cloud.table["id"].astype(np.int64)
@@ -360,6 +360,6 @@ def _rows_of(landmarks: Map, cloud: Correspondences) -> IntArray:
 
 
 def _keys(points: Array) -> NDArray[Any]:
-    """Something that points (n,3) are the same by, (n,)."""
+    """Return keys (n,) by which points (n,3) are compared."""
     single = np.ascontiguousarray(points, np.float32) + np.float32(0.0)
     return single.view([("", np.float32)] * 3).ravel()

@@ -111,7 +111,7 @@ class Refinement:
         )
 
     def _known(self) -> tuple[Array, bool]:
-        """Deviations (p,) of the landmarks, m, and whether nothing holds the whole."""
+        """Return deviations (p,) of the landmarks, m, and whether nothing holds the whole."""
         given = self.wanted.deviations
         if given is None:
             given = np.full(len(self.given.points), np.inf)
@@ -124,7 +124,7 @@ class Refinement:
         return np.minimum(given, _LOOSE * self.size), anchors == 0
 
     def _usable(self) -> BoolArray:
-        """Keypoints (n,) that say something of map or motion."""
+        """Return a mask (n,) of keypoints that constrain map or motion."""
         shared = np.zeros(len(self.given.points), np.bool_)
         found = shared_landmarks(self.shown)
         shared[: len(found)] = found
@@ -135,7 +135,7 @@ class Refinement:
         return used & (counts >= LEAST_KEYPOINTS)[self.shown.images]
 
     def _spline(self) -> Spline:
-        """Through the images with keypoints, of a rig's frames through those with most.
+        """Return a spline through images with keypoints, of a rig through the frames with most.
 
         Images that follow each other are one stretch.
         """
@@ -160,18 +160,18 @@ class Refinement:
         return self._longest() >= _LEAST_STRETCH
 
     def _longest(self) -> int:
-        """Images in the longest stretch."""
+        """Return the number of images in the longest stretch."""
         own = self.times[np.unique(self.shown.images[self.used])]
         return int(np.bincount(self.spline.layout.stretches(own)).max())
 
     def keypoints(self, camera: int) -> BoolArray:
-        """Which (n,) are used of a camera."""
+        """Return a mask (n,) of the used keypoints of a camera."""
         return np.asarray(
             self.used & (self.shown.of_cameras[self.shown.images] == camera), np.bool_
         )
 
     def _observations(self) -> list[SplineKeypoints]:
-        """Keypoints of each camera."""
+        """Return the keypoints of each camera."""
         every = []
         for k, one in enumerate(self.rig):
             used = self.keypoints(k)
@@ -190,7 +190,7 @@ class Refinement:
         return every
 
     def problem(self, freedom: Freedom, held: bool = False) -> Problem:
-        """The problem of map and motion; ``held``: the map is as it is, only the motion is free."""
+        """Return the problem of map and motion; ``held``: only the motion is free."""
         views = [
             CameraView(one.camera, own, replace(freedom, mounting=None if held else one.mounting))
             for one, own in zip(self.rig, self.seen, strict=True)
@@ -216,7 +216,7 @@ class Refinement:
         return self._result(problem, before, deviation)
 
     def _of_all(self, name: str) -> NDArray[Any]:
-        """A field of the observations of all cameras, one after the other."""
+        """Return a field of the observations of all cameras, one after the other."""
         return np.concatenate([getattr(own, name) for own in self.seen])
 
     def _result(self, problem: Problem, before: float, deviation: float) -> RefinedMap:
@@ -276,7 +276,7 @@ class Refinement:
         return tuple(drifts)
 
     def _cluster_robust(self, problem: Problem, deviation: float, independent: float) -> float:
-        """The covariances' inflation, with what errors of a second pull together."""
+        """Return the inflation of the covariances by errors of a second that pull together."""
         squared, every = problem.errors(self.state), problem.keypoint_rows(self.state, deviation)
         rows = np.concatenate([np.dstack([of.values[..., -3:], of.errors]) for of in every])
         inside = squared[squared < (LIMIT * deviation) ** 2]
@@ -286,7 +286,7 @@ class Refinement:
         return Pull(own * pull.measured, pull.expected).inflation(independent)
 
     def _freedoms(self, spline: Spline) -> int:
-        """How many numbers of the motion the images determine: a pose each, and an end.
+        """Count the numbers of the motion that images determine: a pose each, and an end.
 
         Those of a global shutter say nothing of what lies between them.
         """
@@ -300,7 +300,7 @@ class Refinement:
     def _cameras(
         self, problem: Problem, deviation: float, inflation: float, shared: Array
     ) -> tuple[Adjusted, ...]:
-        """The cameras, with the covariance (s,s) of what all images share."""
+        """Return the cameras, with the covariance (s,s) of what all images share."""
         asked, spread, found = self._asked(deviation, inflation), np.sqrt(np.diag(shared)), []
         free = self.freedom.readout_time
         for k, (one, wanted, state) in enumerate(
@@ -315,7 +315,7 @@ class Refinement:
         return tuple(found)
 
     def _asked(self, deviation: float, inflation: float) -> list[ReadoutCheck | None]:
-        """Readout times that images ask for where others were given: a step from the minimum."""
+        """Return readout times that images ask for instead of given ones, by a Newton step."""
         known = [one.camera.readout_time > 0.0 for one in self.rig]
         none: list[ReadoutCheck | None] = [None] * len(known)
         if self.freedom.readout_time or not any(known) or not self.tells_readout:
@@ -405,7 +405,7 @@ class RefinedMap:
         return replace(self.camera, scan_direction=direction)
 
     def poses(self) -> tuple[Array, Array]:
-        """Poses of the rig's axes in the map (g,3,3), (g,3) at the images' middle rows."""
+        """Return poses of the rig's axes in the map (g,3,3), (g,3) at the images' middle rows."""
         states = self.spline.states(self.times)
         return states.rotations, states.positions
 
@@ -419,7 +419,7 @@ def refine(
     stamp_offset: float = 0.0,
     done: Callable[[str], object] = lambda text: None,
 ) -> RefinedMap:
-    """The most likely map and motion, as of :func:`refine_rig`.
+    """Return the most likely map and motion, as of :func:`refine_rig`.
 
     Args:
         camera: its lens, scan direction and readout time (0: a global shutter).
@@ -436,7 +436,7 @@ def refine_rig(
     *,
     done: Callable[[str], object] = lambda text: None,
 ) -> RefinedMap:
-    """The most likely map and motion of a rig.
+    """Return the most likely map and motion of a rig.
 
     Args:
         rig: its cameras.
@@ -459,7 +459,7 @@ def refine_rig(
 
 
 def _as_in(one: Adjusted, state: Unknowns) -> Adjusted:
-    """A camera with the lens, the readout time and the extrinsics of a state."""
+    """Return a camera with the lens, the readout time and the extrinsics of a state."""
     readout_time = float(state.readout_time)
     camera = with_lens(replace(one.camera, readout_time=abs(readout_time)), state.lens)
     return replace(one, camera=camera, readout_time=readout_time, extrinsics=state.extrinsics)

@@ -17,7 +17,7 @@ _MANY = 0.1
 
 
 def rows(built: Built, images: int, views: int) -> list[tuple[str, str]]:
-    """The table: what was measured, name and text.
+    """Return the table of results: name and text.
 
     Args:
         images: of the recording.
@@ -50,7 +50,7 @@ def rows(built: Built, images: int, views: int) -> list[tuple[str, str]]:
 
 
 def advice(built: Built, views: Sequence[SeenImage]) -> list[str]:
-    """Sentences on how to film a better map."""
+    """Return sentences on how to film a better map."""
     said = []
     posed = np.zeros(len(views), np.bool_)
     posed[built.posed] = True
@@ -76,7 +76,7 @@ def advice(built: Built, views: Sequence[SeenImage]) -> list[str]:
 
 
 def written(built: Built, images: int, views: Sequence[SeenImage]) -> str:
-    """The same as a page of Markdown."""
+    """Return the report as a page of Markdown."""
     table = "\n".join(f"| {name} | {text} |" for name, text in rows(built, images, len(views)))
     film = "".join(f"* {text}\n" for text in advice(built, views))
     film = f"\nTo film otherwise:\n\n{film}" if film else ""
@@ -117,7 +117,7 @@ def _lens(built: Built) -> str:
 
 
 def _when(rows: BoolArray, seconds: np.ndarray) -> str:
-    """The times of views as a sentence: at most three stretches, the longest ones."""
+    """Return the times of views as a sentence: at most three stretches, the longest ones."""
     marks = np.flatnonzero(np.diff(np.concatenate([[False], rows, [False]]).astype(int)))
     parts = sorted(zip(marks[::2], marks[1::2] - 1, strict=True), key=lambda p: p[0] - p[1])[:3]
     return "from " + ", ".join(f"{seconds[a]:.1f} to {seconds[b]:.1f} s" for a, b in sorted(parts))

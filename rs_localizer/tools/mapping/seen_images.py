@@ -57,7 +57,7 @@ class SeenImage:
 
 
 def sharpness(image: Gray) -> float:
-    """How much of the picture is fine detail: grey levels (rms) of the Laplacian."""
+    """Return the fine detail of a picture: grey levels (rms) of the Laplacian."""
     return float(cv2.Laplacian(image, cv2.CV_32F, ksize=3).std())
 
 
@@ -76,7 +76,7 @@ class Looker:
         self._detector = None if marker_map is None else MarkerDetector(marker_map)
 
     def detect_in(self, image: Image) -> SeenImage:
-        """The view of an image."""
+        """Return the view of an image."""
         path = self._images / image_name(self._count)
         self._count += 1
         quality = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
@@ -91,7 +91,7 @@ class Looker:
 
 
 def blurred(views: Sequence[SeenImage]) -> BoolArray:
-    """Which views (n,) are much less sharp than those around them."""
+    """Return a mask (n,) of views that are much less sharp than those around them."""
     values = np.array([view.sharpness for view in views])
     rows = np.arange(len(values))
     usual = [np.median(values[max(0, row - _AROUND) : row + _AROUND + 1]) for row in rows]
@@ -191,7 +191,7 @@ def check_features(views: Sequence[SeenImage]) -> None:
 
 
 def _moved(one: SeenImage, other: SeenImage) -> float:
-    """How far features move (median), by the size of the picture; infinite: they are others."""
+    """Return the median motion of features, over the picture's size; infinite: other ones."""
     if min(len(one.features), len(other.features)) < _FEW_FEATURES:
         return math.inf
     matcher = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True)
@@ -207,7 +207,7 @@ def _moved(one: SeenImage, other: SeenImage) -> float:
 
 
 def choose_keyframes(views: Sequence[SeenImage]) -> IntArray:
-    """Rows (k,) of the views that COLMAP gets: evenly spaced, the sharpest of each few."""
+    """Return rows (k,) of views for COLMAP: evenly spaced, the sharpest of each few."""
     seconds = 1e-9 * (views[-1].stamp_ns - views[0].stamp_ns)
     count = max(_KEYFRAMES, math.ceil(_KEYFRAMES_PER_SECOND * seconds))
     slots = np.array_split(np.arange(len(views)), min(count, len(views)))

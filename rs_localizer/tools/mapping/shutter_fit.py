@@ -25,7 +25,7 @@ LEAST_FIT = 0.8
 
 
 def likely_axes(size: tuple[int, int], given: str | None) -> list[ScanDirection]:
-    """Scan directions to try, their reverses included, the likelier first; only a given one.
+    """Return scan directions to try, with their reverses, likelier first; only a given one.
 
     The rows of sensors lie along their longer side, also where a driver or a phone has turned the
     images.
@@ -43,7 +43,7 @@ _LENS_DEVIATIONS = 0.005, 0.02
 
 
 def colmap_freedom(seen: MapObservations, start: Start, lens: bool) -> MapFreedom:
-    """Unknowns of a map that COLMAP has begun; ``lens``: its lens, too.
+    """Return the unknowns of a map that COLMAP has begun; ``lens``: its lens, too.
 
     A time lapse, whose stamps are closer than its images were, moves faster than any hand.
     """
@@ -67,11 +67,11 @@ def fit_shutter(
     directions: Sequence[ScanDirection],
     done: Callable[[str], object],
 ) -> tuple[RefinedMap, ShutterFit | None]:
-    """The map refined with the shutter that explains the images best.
+    """Refine the map with the shutter that explains the images best.
 
-    A shutter that does not explain them significantly better than a global one is not believed.
-    Where no smooth motion fits them, or as well as the first guess (a time lapse, cuts), each image
-    has a pose of its own, as COLMAP has it, and the shutter stays unknown.
+    A shutter is only believed if it explains them significantly better than a global one. If no
+    smooth motion fits them as well as the first guess (a time lapse, cuts), each image keeps its
+    own pose, as in COLMAP, and the shutter stays unknown.
 
     Args:
         camera: its lens; the shutter does not matter.
@@ -106,7 +106,7 @@ def refine_with_shutter(
     camera: Camera, observations: MapObservations, start: Start, freedom: MapFreedom,
     shutter: tuple[float | None, Sequence[ScanDirection]], done: Callable[[str], object],
 ) -> tuple[RefinedMap, ShutterFit | None, ReadoutCheck | None]:  # fmt: skip
-    """The map refined with a given readout time (s) along the first direction, and its check.
+    """Refine the map with a given readout time (s), and check it.
 
     Else, or where the images contradict it, as of :func:`fit_shutter`.
 
@@ -126,13 +126,13 @@ def refine_with_shutter(
 
 
 def global_errors(camera: Camera, observations: MapObservations, start: Start) -> Array:
-    """Distances (n,), px, of keypoints from where a global shutter would have seen them."""
+    """Return distances (n,), px, of keypoints from their global-shutter projections."""
     found = camera.project(start.local(observations)) - observations.pixels
     return np.asarray(np.linalg.norm(found, axis=1))
 
 
 def _noise(camera: Camera, observations: MapObservations, start: Start) -> float:
-    """Standard deviation (px) of what the first guess leaves."""
+    """Return the standard deviation (px) of the residuals of the first guess."""
     errors = global_errors(camera, observations, start)
     return noise_of(errors[np.isfinite(errors)] ** 2, np.inf)
 
@@ -141,7 +141,7 @@ def _of_one_motion(
     camera: Camera, observations: MapObservations, start: Start, freedom: MapFreedom,
     directions: Sequence[ScanDirection], done: Callable[[str], object],
 ) -> tuple[RefinedMap, ShutterFit | None]:  # fmt: skip
-    """The map by one smooth motion through images in a row; see :func:`fit_shutter`."""
+    """Refine by one smooth motion through successive images; see :func:`fit_shutter`."""
     still = refine(camera, observations, start, freedom, done=done)
     if not still.tells_readout:
         return still, None
@@ -173,7 +173,7 @@ def _of_one_motion(
 
 
 def _costs(fit: RefinedMap, still: RefinedMap, observations: MapObservations) -> Array:
-    """Squared errors of the images (g,), those of outliers cut off: alike in all fits."""
+    """Return squared errors of the images (g,), outliers cut off alike in all fits."""
     limit = (LIMIT * still.deviation) ** 2
     squared = np.minimum(np.where(np.isfinite(fit.squared_errors), fit.squared_errors, 0.0), limit)
     sums = np.bincount(observations.images, squared, len(observations.stamps_ns))
@@ -181,7 +181,7 @@ def _costs(fit: RefinedMap, still: RefinedMap, observations: MapObservations) ->
 
 
 def _chance(gains: Array) -> float:
-    """Probability that gains (g,) of images are so large by chance (Wilcoxon's signed-rank test).
+    """Return the probability of such gains (g,) by chance (Wilcoxon's signed-rank test).
 
     Images at rest gain nothing, those of a quick turn much.
     """

@@ -79,7 +79,7 @@ def require() -> None:
 
 
 def image_name(row: int) -> str:
-    """The file of a view's image."""
+    """Return the file of a view's image."""
     return f"{row:08d}.jpg"
 
 
@@ -87,7 +87,7 @@ def build_structure(
     images: Path, keyframes: Mapping[int, int], lens: Camera | None, folder: Path, effort: Effort,
     stage: Stage,
 ) -> Structure:  # fmt: skip
-    """Reconstruct the largest part of the keyframes that hangs together.
+    """Reconstruct the largest connected part of the keyframes.
 
     Args:
         images: folder with the images of the keyframes, by :func:`image_name`.
@@ -134,7 +134,7 @@ def build_structure(
 def observed(
     model: Model, names: Sequence[str], stamps_ns: IntArray
 ) -> tuple[MapObservations, Start]:
-    """Keypoints of images of a model, by their names in the order of stamps (g,); and the model.
+    """Return keypoints of a model's images, by their names in order of stamps (g,), and it.
 
     Raises:
         MappingError: for keypoints of points that are not there.
@@ -158,7 +158,7 @@ def observed(
 
 
 def pairs_of(count: int) -> list[tuple[int, int]]:
-    """Pairs ``i < j`` of so many images in the order of time that are worth matching."""
+    """Return pairs ``i < j`` of so many images in the order of time that are worth matching."""
     if count <= _EXHAUSTIVE:
         return [(i, j) for i in range(count) for j in range(i + 1, count)]
     steps = {*range(1, _OVERLAP + 1), *(2**k for k in range(_OVERLAP))}
@@ -168,7 +168,7 @@ def pairs_of(count: int) -> list[tuple[int, int]]:
 
 
 def _run(task: Path, stage: Stage) -> dict[str, Any]:
-    """The task's result; a process that dies is named with the last that it said."""
+    """Return the task's result; name a process that dies with the last that it said."""
     command = [sys.executable, str(_SCRIPT), str(task)]
     # Else a script imports from its own folder first.
     environment = os.environ | {"PYTHONSAFEPATH": "1"}
@@ -204,7 +204,7 @@ def _death(code: int, last: str) -> str:
 
 
 def _nothing(output: dict[str, Any], keyframes: int) -> str:
-    """Why there is no structure."""
+    """Say why there is no structure."""
     return (
         f"no two of the {keyframes} keyframes determine a structure "
         f"({output['features'] / keyframes:.0f} features each, {output['pairs']} pairs of them "

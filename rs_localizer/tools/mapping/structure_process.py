@@ -29,7 +29,7 @@ LEAST_MATCHES = 15
 
 
 def main(task: dict[str, Any]) -> None:
-    """Extract, match and map the images of a task; the largest model is written.
+    """Extract, match and map the images of a task, and write the largest model.
 
     Args:
         task: ``images`` and ``folder`` (paths), ``names`` of the images, ``pairs`` of rows of them,
@@ -95,7 +95,7 @@ def _match(task: dict[str, Any], database: Path) -> None:
 
 
 def _map(task: dict[str, Any], database: Path, folder: Path) -> list[Any]:
-    """COLMAP's models, the largest first."""
+    """Return COLMAP's models, the largest first."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = task["threads"]
     for part in (options, options.mapper, options.triangulation):
@@ -117,7 +117,7 @@ def _map(task: dict[str, Any], database: Path, folder: Path) -> list[Any]:
 
 
 def _statistics(database: Path) -> dict[str, Any]:
-    """Counts of what the model was made of: features, and pairs of images that agree."""
+    """Count what the model was made of: features, and pairs of images that agree."""
     with pycolmap.Database.open(database) as tables:
         _, matches = tables.read_two_view_geometry_num_inliers()
         return {

@@ -69,7 +69,7 @@ class Adjustable:
     seen: Sequence[SplineKeypoints]  # of the landmarks that all see
 
     def start(self, spline: Spline) -> Unknowns:
-        """A first guess."""
+        """Return a first guess."""
         pairs = zip(self.filmed, self.seen, strict=True)
         return rig_state(spline, ((one.camera, own, one.extrinsics) for one, own in pairs))
 
@@ -80,7 +80,7 @@ class Adjustable:
         readout_times: bool = False,
         markers_only: bool = False,
     ) -> Problem:
-        """The problem of all cameras.
+        """Return the problem of all cameras.
 
         Args:
             freedom: of the motion.
@@ -103,17 +103,17 @@ class Adjustable:
         return Problem(views, start, one_map=True)
 
     def fit_roughly(self, start: Unknowns, freedom: Freedom, *free: bool) -> Fit:
-        """The same from far off, as at the end of a chain, where large errors are no outliers."""
+        """Fit from far off, as at the end of a chain, where large errors are no outliers."""
         errors = np.sqrt(self.problem(start, freedom, *free).errors(start))
         return self.fit(start, freedom, float(np.clip(np.median(errors), *_FIRST_NOISE)), *free)
 
     def fit(self, start: Unknowns, freedom: Freedom, deviation: float, *free: bool) -> Fit:
-        """The minimum of a problem."""
+        """Return the minimum of a problem."""
         return solve(self.problem(start, freedom, *free), start, deviation)
 
 
 def _mirrored(given: Adjustable, fitted: Fit) -> tuple[BoolArray, BoolArray, Unknowns]:
-    """Each marker beside its mirror image, the motion held.
+    """Compare each marker with its mirror image, the motion held.
 
     Returns:
         which markers (m,) fit better mirrored, which fit nearly as well one way or the other, and
@@ -140,7 +140,7 @@ def _mirrored(given: Adjustable, fitted: Fit) -> tuple[BoolArray, BoolArray, Unk
 
 
 def _turned_over(every: Sequence[SplineKeypoints], state: Unknowns) -> Array:
-    """Corners (p,3) of each marker mirrored in depth as its images see it."""
+    """Return corners (p,3) of each marker mirrored in depth as its images see it."""
     layout, corners = state.spline.layout, state.landmarks.reshape(-1, 4, 3)
     middles, sight = corners.mean(axis=1), np.zeros((len(corners), 3))
     for seen, own in zip(every, (state, *state.others), strict=True):
@@ -156,7 +156,7 @@ def _turned_over(every: Sequence[SplineKeypoints], state: Unknowns) -> Array:
 
 
 def _steps(system: System, count: int) -> Array:
-    """Steps of all markers (6 m,), each on its own."""
+    """Return steps of all markers (6 m,), each on its own."""
     at = BODY * np.arange(count)[:, None] + np.arange(BODY)
     slope = system.slope[system.groups.motion :]
     blocks = system.corner[at[:, :, None], at[:, None, :]]
@@ -164,7 +164,7 @@ def _steps(system: System, count: int) -> Array:
 
 
 def _costs(problem: Problem, state: Unknowns, deviation: float) -> Array:
-    """Tukey's costs of the corners of each marker (m,)."""
+    """Return Tukey's costs of the corners of each marker (m,)."""
     limit = (LIMIT * deviation) ** 2
     rest = np.maximum(1.0 - problem.errors(state) / limit, 0.0)
     costs = (1.0 - rest**3) * limit / (3.0 * deviation**2)
@@ -173,14 +173,14 @@ def _costs(problem: Problem, state: Unknowns, deviation: float) -> Array:
 
 
 def _normals(state: Unknowns) -> Array:
-    """Normals of the markers (m,3)."""
+    """Return normals of the markers (m,3)."""
     corners = state.landmarks.reshape(-1, 4, 3)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1])
     return np.asarray(normals / np.linalg.norm(normals, axis=1)[:, None])
 
 
 def _at_the_origin(state: Unknowns, landmarks: Array) -> Unknowns:
-    """With these landmarks (p,3), and all moved so that the first four stay where they were."""
+    """Set these landmarks (p,3), and move all so that the first four stay in place."""
     back = through(landmarks[:4], state.landmarks[:4])
     moved = back(landmarks)
     moved[:4] = state.landmarks[:4]
@@ -250,7 +250,7 @@ class Survey:
 def survey(
     filmed: Sequence[Filmed], markers: Sequence[Marker], *, origin: int | None = None
 ) -> Survey:
-    """Poses of the markers that a camera shows, or those of a rig, which need not see the same.
+    """Survey the markers that a camera or a rig shows; cameras need not see the same ones.
 
     Args:
         filmed: by each camera; the motion is that of the rig's axes.
@@ -304,7 +304,7 @@ def _adjusted(
     filmed: Sequence[Filmed], times: Sequence[Array], frames: Sequence[RigImages],
     markers: Sequence[Marker], chained: Chained,
 ) -> Survey | list[int]:  # fmt: skip
-    """The survey, or the markers that do not fit the others."""
+    """Return the survey, or the markers that do not fit the others."""
     posed = [frames[k] for k in chained.frames]
     shown = [sorted(image for frame in posed for camera, image in frame.images if camera == place)
              for place in range(len(filmed))]  # fmt: skip
@@ -364,7 +364,7 @@ def _adjusted(
 def _first_motion(
     filmed: Sequence[Filmed], times: Sequence[Array], posed: Sequence[RigImages], chained: Chained
 ) -> Spline:
-    """Through the frames with a pose."""
+    """Return a spline through the frames with a pose."""
     rotations = np.array([pose.rotation for pose in chained.poses])
     positions = np.array([pose.translation for pose in chained.poses])
     # Images of a frame reach beyond its middle.
@@ -378,7 +378,7 @@ def _first_motion(
 
 
 def _right_side_up(given: Adjustable, fitted: Fit) -> tuple[Fit, BoolArray]:
-    """With all markers turned as they fit best, and for which (m,) that cannot be told."""
+    """Turn all markers as they fit best; return also a mask (m,) of undecided ones."""
     for _ in range(_MOST_TURNS):
         better, doubtful, other = _mirrored(given, fitted)
         if not better.any():
@@ -392,7 +392,7 @@ def _right_side_up(given: Adjustable, fitted: Fit) -> tuple[Fit, BoolArray]:
 
 
 def _less_noise(given: Adjustable, fitted: Fit) -> Fit:
-    """With corners that are better than was taken for granted.
+    """Fit again with corners that are better than was assumed.
 
     Weighed too little, they lose to what is known of accelerations beforehand, and the readout time
     with them.
@@ -404,7 +404,7 @@ def _less_noise(given: Adjustable, fitted: Fit) -> Fit:
 
 
 def _covariance(fitted: Fit, order: list[int]) -> Array:
-    """Covariance of markers (6 m, 6 m) in an order whose first is the origin, number 0."""
+    """Return the covariance (6 m, 6 m) of markers in an order that starts at the origin."""
     shared = len(fitted.border_covariance) - BODY * (len(fitted.state.landmarks) // 4 - 1)
     places = np.array(order[1:])[:, None] - 1
     columns = (shared + BODY * places + np.arange(BODY)).ravel()
@@ -414,7 +414,7 @@ def _covariance(fitted: Fit, order: list[int]) -> Array:
 
 
 def _grown(given: Adjustable, start: Unknowns, freedom: Freedom, grown: Array) -> Array:
-    """Logarithms (m,) of how much larger markers are than said, of those that certainly are.
+    """Return log sizes (m,) over the given ones, for markers whose size certainly differs.
 
     All sizes free at once would drift along a chain of markers by what errors have in common, which
     costs each of them next to nothing. So most are held, and one at a time is let go; and readout
@@ -452,14 +452,14 @@ def _grown(given: Adjustable, start: Unknowns, freedom: Freedom, grown: Array) -
 
 
 def _cheaper(given: Adjustable, sized: Fit, plain: Fit) -> bool:
-    """True where a size more certainly lowers the cost."""
+    """Return True if one more size certainly lowers the cost."""
     problem = given.problem(plain.state, plain.freedom, True)
     gain = problem.system(plain.state, sized.deviation).cost - sized.cost
     return bool(gain > _SIGMAS**2 * cluster_robust(problem, plain).inflation)
 
 
 def _least_growth(given: Adjustable, fitted: Fit, grown: Array) -> Array:
-    """The same of the few markers that lower the cost most.
+    """Return the log sizes of the few markers that lower the cost most.
 
     One by one the size is freed that lowers the cost most (orthogonal matching pursuit; Pati et
     al., Asilomar 1993), while it does so certainly.
@@ -498,7 +498,7 @@ def _least_growth(given: Adjustable, fitted: Fit, grown: Array) -> Array:
 
 
 def _resized(state: Unknowns, grown: Array) -> Unknowns:
-    """With markers larger by factors of these logarithms (m,)."""
+    """Return the state with markers larger by factors of these logarithms (m,)."""
     corners = state.landmarks.reshape(-1, 4, 3)
     middles = corners.mean(axis=1, keepdims=True)
     larger = middles + np.exp(grown)[:, None, None] * (corners - middles)
@@ -506,7 +506,7 @@ def _resized(state: Unknowns, grown: Array) -> Unknowns:
 
 
 def _wrong_sizes(said: Sequence[Marker], grown: Array) -> str:
-    """Sentence about markers that disagree with most, and the sizes that would fit."""
+    """Name markers whose size disagrees with most, and the sizes that would fit."""
     listed = [
         f"{said[k].name} {said[k].size * np.exp(grown[k]):.4f} m (given {said[k].size:.4g})"
         for k in np.flatnonzero(grown).tolist()
@@ -521,7 +521,7 @@ def _wrong_sizes(said: Sequence[Marker], grown: Array) -> str:
 def _fitting(
     posed: Sequence[RigImages], seen: Sequence[SplineKeypoints], inliers: BoolArray, count: int
 ) -> tuple[BoolArray, BoolArray]:
-    """Which markers (m,) hang together by frames in which they fit, and which others do not fit.
+    """Return masks (m,) of markers connected by fitting frames, and of those that do not fit.
 
     Two walls of which each fits by itself, and no image that shows both, are not one map.
     """
@@ -564,7 +564,7 @@ def _check_places(survey: Survey) -> None:
 
 
 def _cameras(given: Adjustable, fitted: Fit) -> Iterator[Adjusted]:
-    """The cameras, with the readout times that the corners ask for where one was given."""
+    """Yield the cameras, with the readout times that corners ask for instead of given ones."""
     problem, asked = given.problem(fitted.state, fitted.freedom), fitted
     if any(one.camera.readout_time > 0.0 for one in given.filmed):
         asked = given.fit(fitted.state, fitted.freedom, fitted.deviation, True)
@@ -593,7 +593,7 @@ def _cameras(given: Adjustable, fitted: Fit) -> Iterator[Adjusted]:
 
 
 def _often(filmed: Sequence[Filmed], shown: Sequence[list[int]], chained: Chained) -> list[int]:
-    """The origin first, then the other markers that enough images show."""
+    """Return the origin first, then the other markers that enough images show."""
     counts: dict[int, int] = dict.fromkeys(chained.markers, 0)
     for one, images in zip(filmed, shown, strict=True):
         for k in images:
@@ -608,7 +608,7 @@ def _observations(
     filmed: Filmed, images: list[int], times: Array, markers: Sequence[Marker], chained: Chained,
     own: list[int],
 ) -> SplineKeypoints:  # fmt: skip
-    """All corners of some images of a camera.
+    """Return all corners of some images of a camera.
 
     Args:
         times: (g,) s, of all images.

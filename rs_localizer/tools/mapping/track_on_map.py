@@ -36,7 +36,7 @@ def track_on_map(
     camera: Camera,
     done: Callable[[], object] = lambda: None,
 ) -> tuple[IntArray, MapObservations, Start]:
-    """Rows (k,) of the views with a pose, and what they show.
+    """Return rows (k,) of the views with a pose, and what they show.
 
     Keyframes are where COLMAP has them, the others are localized.
 

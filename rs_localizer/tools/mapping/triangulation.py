@@ -50,7 +50,7 @@ class Triangulated:
         return spread
 
     def chosen(self, rows: IntArray) -> Triangulated:
-        """Some (p,) of the points, with the keypoints of all."""
+        """Return some (p,) of the points, with the keypoints of all."""
         return replace(
             self, points=self.points[rows], covariances=self.covariances[rows],
             counts=self.counts[rows],
@@ -58,7 +58,7 @@ class Triangulated:
 
 
 def triangulate(camera: Camera, sights: Sights, count: int) -> Triangulated:
-    """The most likely places of points, robustly.
+    """Return the most likely places of points, robustly.
 
     Args:
         camera: its lens.
@@ -95,7 +95,7 @@ def moves(
     camera: Camera, sights: Sights, triangulated: Triangulated,
     others: Sequence[tuple[Camera, Sights]],
 ) -> Array:  # fmt: skip
-    """Displacements of points (p,3,k) if the same keypoints were seen otherwise.
+    """Return displacements of points (p,3,k) if the same keypoints were seen otherwise.
 
     To first order, with the weights that they have.
 
@@ -116,7 +116,7 @@ def moves(
 
 
 def _nearest_to_rays(camera: Camera, sights: Sights, count: int) -> Array:
-    """Points (p,3) with the least squared distances to the rays; NaN: parallel rays."""
+    """Return points (p,3) nearest to the rays; NaN for parallel rays."""
     rays = camera.rays(sights.pixels)
     directions = np.einsum(
         "nij,nj->ni", sights.rotations, np.column_stack([rays, np.ones(len(rays))])
@@ -137,7 +137,7 @@ def _nearest_to_rays(camera: Camera, sights: Sights, count: int) -> Array:
 
 
 def _errors(camera: Camera, sights: Sights, points: Array) -> tuple[Array, Array]:
-    """Errors (n,2) px and their derivatives (n,2,3) by the points; NaN behind the camera."""
+    """Return errors (n,2) px and their derivatives (n,2,3) by the points; NaN if behind."""
     inverse = np.swapaxes(sights.rotations, 1, 2)
     local = np.einsum("nij,nj->ni", inverse, points[sights.points] - sights.positions)
     depth = np.where(local[:, 2] > 0.0, local[:, 2], np.nan)
@@ -151,7 +151,7 @@ def _errors(camera: Camera, sights: Sights, points: Array) -> tuple[Array, Array
 
 
 def _inverses(matrices: Array) -> Array:
-    """Inverses (p,3,3) of symmetric matrices; NaN where there is none."""
+    """Return inverses (p,3,3) of symmetric matrices; NaN where there is none."""
     values = np.linalg.eigvalsh(np.nan_to_num(matrices))
     good = values[:, 0] > 1e-10 * np.maximum(values[:, 2], 1e-300)
     inverses = np.full_like(matrices, np.nan)
@@ -160,7 +160,7 @@ def _inverses(matrices: Array) -> Array:
 
 
 def _sums(values: Array, groups: IntArray, count: int) -> Array:
-    """Sums (count,...) of values (n,...) by group (n,)."""
+    """Return sums (count,...) of values (n,...) by group (n,)."""
     picks = csr_array(
         (np.ones(len(groups)), (groups, np.arange(len(groups)))), shape=(count, len(groups))
     )

@@ -40,7 +40,7 @@ class Spotted:
     quads: Array  # (m,4,2) raw pixels: top left, top right, bottom right, bottom left
 
     def without(self, markers: Sequence[int]) -> Spotted:
-        """The others."""
+        """Return the other markers."""
         others = ~np.isin(self.markers, markers)
         return Spotted(self.stamp_ns, self.markers[others], self.quads[others])
 
@@ -48,7 +48,7 @@ class Spotted:
 def every_marker(
     families: Sequence[Family], size: float, sizes: Mapping[int, float]
 ) -> tuple[Marker, ...]:
-    """All markers of some families, all of them at the origin.
+    """Return all markers of some families, all of them at the origin.
 
     Args:
         families: of different kinds.
@@ -74,7 +74,7 @@ class Spotter:
         self._end = 4 * len(markers)
 
     def spot(self, image: NDArray[np.uint8], stamp_ns: int) -> Spotted:
-        """The markers of an image (h,w)."""
+        """Return the markers of an image (h,w)."""
         found = self._detector.detect(image, stamp_ns)
         whole = _whole_markers(found, self._end)
         quads = [found.pixels[rows] for rows in whole.values()]
@@ -82,7 +82,7 @@ class Spotter:
 
 
 def _whole_markers(detections: Detections, end: int) -> dict[int, IntArray]:
-    """Rows of the detections for each single marker of which all four corners were found."""
+    """Return rows of the detections for each single marker of which all four corners were found."""
     place = {int(id_): row for row, id_ in enumerate(detections.ids) if id_ < end}
     markers = sorted({id_ // 4 for id_ in place})
     corners = {m: [place.get(4 * m + k, -1) for k in range(4)] for m in markers}
@@ -110,7 +110,7 @@ class Filmed(RigCamera):
     spotted: Sequence[Spotted] = ()  # in the order of their stamps
 
     def times(self, start_ns: int) -> Array:
-        """When the images' middle rows were exposed (g,), s."""
+        """Return the times (g,), s, at which the images' middle rows were exposed."""
         stamps = np.array([(image.stamp_ns - start_ns) * 1e-9 for image in self.spotted])
         return stamps + self.delay
 
@@ -184,7 +184,7 @@ _WRONG_SIZE = 0.1
 
 
 def _growth(views: Sequence[_FrameView]) -> dict[int, float]:
-    """Logarithms of how much larger markers are than they are said to be, beside most others.
+    """Return log sizes of markers over the given ones, beside most others.
 
     The camera's way about a marker of the wrong size is too long or too short by that: two markers
     of one image are at the same place beside each other whatever the way, which tells the ratio of
@@ -239,7 +239,7 @@ def _view(
 
 
 def _square_poses(corners: Array, rays: Array, doubt: float) -> list[tuple[Transform, float]]:
-    """Poses camera_from_marker that fit rays (4,2), and how far they do, of 1."""
+    """Return poses camera_from_marker that fit rays (4,2), and their weights, of 1."""
     try:
         count, turns, places, errors = cv2.solvePnPGeneric(
             corners, np.ascontiguousarray(rays), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
@@ -263,7 +263,7 @@ def _square_poses(corners: Array, rays: Array, doubt: float) -> list[tuple[Trans
 def _between(
     views: list[_FrameView], markers: Sequence[Marker]
 ) -> tuple[dict[tuple[int, int], Transform], dict[tuple[int, int], float]]:
-    """Transforms a_from_b of each pair a < b, and by how many images they are said."""
+    """Return transforms a_from_b of each pair a < b, and the number of images that support them."""
     images: dict[tuple[int, int], list[tuple[_MarkerSight, _MarkerSight]]] = {}
     apart: dict[
         tuple[int, int], list[tuple[_MarkerSight, _MarkerSight]]
@@ -292,7 +292,7 @@ def _between(
 
 
 def _agreed(said: list[tuple[int, Transform, float]], size: float) -> tuple[Transform, float]:
-    """The transform that most images say, of several that fit more or less; and by how many."""
+    """Return the transform that most images support, and by how many."""
     image = np.array([k for k, _, _ in said])
     turns = np.array([of.rotation for _, of, _ in said])
     places = np.array([of.translation for _, of, _ in said])
@@ -318,7 +318,7 @@ def _agreed(said: list[tuple[int, Transform, float]], size: float) -> tuple[Tran
 
 
 def _parts(markers: list[int], scores: dict[tuple[int, int], float]) -> list[list[int]]:
-    """Markers that hang together, the most first."""
+    """Return connected markers, the largest part first."""
     place = {marker: k for k, marker in enumerate(markers)}
     pairs = np.array([[place[a], place[b]] for a, b in scores], np.int32).reshape(-1, 2)
     graph = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(markers),) * 2)
@@ -331,7 +331,7 @@ def _placed(
     origin: int, own: list[int], between: dict[tuple[int, int], Transform],
     scores: dict[tuple[int, int], float],
 ) -> dict[int, Transform]:  # fmt: skip
-    """origin_from_marker along the chains of what most images say."""
+    """Return origin_from_marker along the best supported chains."""
     place = {marker: k for k, marker in enumerate(own)}
     inside = [(pair, score) for pair, score in scores.items() if pair[0] in place]
     # SciPy 1.11 has no trees of other indices.
@@ -354,7 +354,7 @@ def _frame_poses(
     views: list[_FrameView], mounts: list[Transform], placed: dict[int, Transform],
     markers: Sequence[Marker],
 ) -> tuple[list[int], list[Transform]]:  # fmt: skip
-    """Frames with a pose, and origin_from_rig of each."""
+    """Return frames with a pose, and origin_from_rig of each."""
     frames: list[int] = []
     poses: list[Transform] = []
     for k, view in enumerate(views):
@@ -392,7 +392,7 @@ def _corners(marker: Marker, placed: Transform) -> Array:
 
 
 def _cost(pose: Transform, points: Array, rays: Array) -> float:
-    """Squared errors of points (n,3) under camera_from_origin, gross ones limited."""
+    """Return squared errors of points (n,3) under camera_from_origin, gross ones limited."""
     local = points @ pose.rotation.T + pose.translation
     ahead = local[:, 2] > 0.0
     depth = np.where(ahead, local[:, 2], 1.0)

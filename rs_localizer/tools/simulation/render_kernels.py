@@ -36,7 +36,7 @@ def render_lines(
     last: int,
     image: Out[SingleArray2],
 ) -> None:
-    """Mean grey level of each pixel in the lines from ``first`` to before ``last``.
+    """Write the mean grey level of each pixel in the lines ``first`` to before ``last``.
 
     Every pixel averages its rays over all instants of its exposure. A ray takes the nearest
     plane that it meets within its picture, between the two reductions whose texels are nearest in
@@ -112,7 +112,7 @@ def render_lines(
 
 @kernel
 def _bilinear(texels: Any, levels: Any, plane: int, level: int, s: Any, t: Any) -> Any:
-    """Between the four texels around (s, t), which count in texels of level 0."""
+    """Interpolate between the four texels around (s, t), which count in texels of level 0."""
     start, width, height = levels[plane, level, 0], levels[plane, level, 1], levels[plane, level, 2]
     scale = _ONE / np.float32(1 << level)
     x = min(max(s * scale - _HALF, _ZERO), np.float32(width - 1))

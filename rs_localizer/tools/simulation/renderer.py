@@ -29,7 +29,7 @@ from rs_localizer.tools.simulation.walls import TexturedPlane
 
 
 def pyramids(planes: Sequence[TexturedPlane]) -> tuple[Image, NDArray[np.int64]]:
-    """The pictures of several planes with all their reductions, for the kernel.
+    """Return the pictures of several planes with all their reductions, for the kernel.
 
     Returns texels (n,) and levels (planes, levels, 3): ``levels[p, l]`` is where level ``l`` of
     picture ``p`` begins, its width and height; each level averages two by two texels of the one
@@ -99,7 +99,7 @@ class Renderer:
         self._tau = first + step * np.arange(self._rays.shape[0])
 
     def image(self, motion: TrueMotion, stamp_ns: int, seed: Sequence[int] = (0,)) -> Image:
-        """The image (height, width) whose first row is exposed around ``stamp_ns``.
+        """Return the image (height, width) whose first row is exposed around ``stamp_ns``.
 
         Args:
             seed: of the noise.
@@ -124,7 +124,7 @@ class Renderer:
         return np.clip(np.rint(image), 0.0, 255.0).astype(np.uint8)
 
     def _exposure_instants(self, motion: TrueMotion, middle_ns: int) -> Array:
-        """Offsets (m,) in s from a row's time, evenly over the exposure."""
+        """Return offsets (m,) in s from a row's time, evenly over the exposure."""
         exposure = self.settings.exposure
         if exposure == 0.0:
             return np.zeros(1)
@@ -142,7 +142,7 @@ class Renderer:
 
 
 def _rays(camera: Camera, sideways: bool) -> NDArray[np.float32]:
-    """Bearings (lines, pixels, rays, 2) float32 of the rays of all pixels."""
+    """Return bearings (lines, pixels, rays, 2) float32 of the rays of all pixels."""
     width, height = camera.size
     size, other = (width, height) if sideways else (height, width)
     line, pixel, j, i = np.meshgrid(
@@ -178,7 +178,7 @@ def rendered_frames(
     stamps_ns: Sequence[int],
     seed: int = 0,
 ) -> Iterator[RenderedFrame]:
-    """The frames of a camera along a motion, whose first rows are exposed at ``stamps_ns``.
+    """Yield frames along a motion, whose first rows are exposed at ``stamps_ns``.
 
     Each image has its own noise, from ``seed`` and its place in the list.
     """
@@ -205,7 +205,7 @@ def _jpeg(image: Image) -> bytes:
 
 
 def in_order(work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """``map`` with a thread per core; only a few results wait, however slowly they are taken."""
+    """Yield results of ``map`` with a thread per core; only a few wait to be taken."""
     workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2
     waiting: deque[Future[R]] = deque()
     with ThreadPoolExecutor(workers) as pool:

@@ -21,7 +21,7 @@ _CLEARANCE = 0.8
 
 
 def room(positions: Array, rng: np.random.Generator, count: int = _POINTS) -> Array:
-    """Points (count,3) on the walls of a room and on boxes in it, around positions (n,3).
+    """Return points (count,3) on walls of a room and boxes in it, around positions (n,3).
 
     The same positions and generator state give the same room.
     """
@@ -45,7 +45,7 @@ def _walls(low: Array, high: Array, count: int, rng: np.random.Generator) -> Arr
 def _boxes(
     low: Array, high: Array, positions: Array, count: int, rng: np.random.Generator
 ) -> Array:
-    """Points on upright boxes that keep clear of the positions."""
+    """Return points on upright boxes that keep clear of the positions."""
     path = positions[:: max(1, len(positions) // 500)]
     centres = rng.uniform(low, high, size=(20 * _BOXES, 3))
     distances = np.linalg.norm(centres[:, None] - path[None], axis=2).min(axis=1)

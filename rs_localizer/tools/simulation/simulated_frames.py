@@ -58,7 +58,7 @@ class SimulatedFrame:
 
 
 def frame_stamps(motion: TrueMotion, camera: Camera, rate: float) -> list[int]:
-    """Times in ns of all frames whose readout lies within a stretch of the motion.
+    """Return times (ns) of all frames whose readout lies within a stretch of the motion.
 
     The camera runs on through the gaps of a recorded motion, but what it saw there is unknown:
     these frames are left out.
@@ -71,14 +71,14 @@ def frame_stamps(motion: TrueMotion, camera: Camera, rate: float) -> list[int]:
 
 
 def middle_stamp(camera: Camera, stamp_ns: int) -> int:
-    """When the sensor's middle row is exposed, of a frame whose first row is at ``stamp_ns``."""
+    """Return the time of the middle row, of a frame whose first row is at ``stamp_ns``."""
     return stamp_ns + round(-camera.first_row_time * camera.readout_time * 1e9)
 
 
 def true_poses_at(
     camera: Camera, motion: TrueMotion, middle_ns: int
 ) -> Callable[[Array], tuple[Array, Array]]:
-    """Row times (n,) to poses camera_from_map along a motion, for ``project_rolling``."""
+    """Map row times (n,) to poses camera_from_map of a motion, for ``project_rolling``."""
 
     def poses_at(tau: Array) -> tuple[Array, Array]:
         # The search for the row may stray, or end as NaN: no such row is ever inside the image.
@@ -99,7 +99,7 @@ def simulate_frames(
     stamps_ns: list[int] | None = None,
     seed: int = 0,
 ) -> Iterator[SimulatedFrame]:
-    """The frames that a camera sees of a map (m,3) along a motion.
+    """Yield the frames that a camera sees of a map (m,3) along a motion.
 
     Args:
         camera: its readout time and scan direction decide when each row is exposed.
@@ -136,7 +136,7 @@ def _visible(
     settings: FrameSettings,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.int64], Array]:
-    """A random choice of the points that some row sees: their ids (n,) and true pixels (n,2)."""
+    """Draw points that some row sees: their ids (n,) and true pixels (n,2)."""
     poses_at = true_poses_at(camera, motion, middle_ns)
     size = np.array(camera.size)
     rotations, translations = poses_at(np.zeros(1))

@@ -82,7 +82,7 @@ class Shaken:
 def shaken(
     motion: TrueMotion, vibrations: list[tuple[float, float]], rng: np.random.Generator
 ) -> TrueMotion:
-    """A motion with vibrations (degrees, Hz), each about any axis and from any phase."""
+    """Return a motion with vibrations (degrees, Hz), each about any axis and from any phase."""
     for degrees, hertz in vibrations:
         axis = rng.normal(size=3)
         phase = float(rng.uniform(0.0, 2.0 * math.pi))
@@ -117,7 +117,7 @@ class ImuTrack:
 def simulate_imu(
     motion: TrueMotion, settings: ImuSettings, lever: Lever, rng: np.random.Generator
 ) -> ImuTrack:
-    """The readings all along a motion; none where a recorded motion has gaps."""
+    """Return the readings all along a motion; none where a recorded motion has gaps."""
     times = np.concatenate(
         [
             first + np.round(np.arange(0.0, last - first, 1e9 / settings.rate)).astype(np.int64)
@@ -143,7 +143,7 @@ def simulate_imu(
 
 
 def _chunks(times: IntArray) -> Iterator[IntArray]:
-    """Cut where a motion has gaps, and where rounding of seconds would begin to show."""
+    """Return the cut where a motion has gaps, and where rounding of seconds would begin to show."""
     steps = np.diff(times, prepend=times[:1])[1:]
     ends = np.flatnonzero(steps > 2 * np.median(steps)) + 1
     for part in np.split(times, ends):
@@ -151,7 +151,7 @@ def _chunks(times: IntArray) -> Iterator[IntArray]:
 
 
 def _true(motion: TrueMotion, times: IntArray, lever: Lever) -> tuple[Array, Array]:
-    """Body rates and specific forces (n,3) in IMU axes."""
+    """Return the body rates and specific forces (n,3) in IMU axes."""
     offsets = (times - times[0]) * 1e-9
     state = motion.state(int(times[0]), offsets)
     ends = [_velocity(motion, times, offsets + shift, lever) for shift in (-_STEP, _STEP)]
@@ -161,7 +161,7 @@ def _true(motion: TrueMotion, times: IntArray, lever: Lever) -> tuple[Array, Arr
 
 
 def _velocity(motion: TrueMotion, times: IntArray, offsets: Array, lever: Lever) -> Array:
-    """Velocities (n,3) of the IMU in the map."""
+    """Return the velocities (n,3) of the IMU in the map."""
     state = motion.state(int(times[0]), offsets)
     velocity = state.linear + np.cross(state.angular, lever.position)
     return np.asarray(np.einsum("nij,nj->ni", state.rotations, velocity), np.float64)
@@ -236,14 +236,14 @@ class ImuBagWriter(BagWriter):
 def make_imu(
     stamp_ns: int, rate: Array, force: Array, settings: ImuSettings, frame: str = IMU_FRAME
 ) -> Any:
-    """A sensor_msgs/Imu: rate (3,) in rad/s, force (3,) in m/s^2; it knows no orientation."""
+    """Make a sensor_msgs/Imu of rate (3,) rad/s and force (3,) m/s^2, without orientation."""
     densities = (settings.gyroscope_noise, settings.accelerometer_noise)
     gyroscope, accelerometer = (density**2 * settings.rate for density in densities)
     return make_reading(stamp_ns, rate, force, frame, (gyroscope, accelerometer))
 
 
 def mounting(lever: Lever) -> Any:
-    """The tf2_msgs/TFMessage that says where the IMU is on the camera."""
+    """Return the tf2_msgs/TFMessage that says where the IMU is on the camera."""
     camera_from_imu = Transform(lever.rotation, lever.position)
     transform = make_transform(make_message, 0, CAMERA_FRAME, IMU_FRAME, camera_from_imu)
     return make_message("tf2_msgs/msg/TFMessage", transforms=[transform])

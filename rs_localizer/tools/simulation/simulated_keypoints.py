@@ -27,12 +27,12 @@ DEVIATION = 0.3
 
 
 def random_descriptors(count: int, rng: np.random.Generator, width: int = 32) -> NDArray[np.uint8]:
-    """Binary descriptors (count,width) without anything in common."""
+    """Return the binary descriptors (count,width) without anything in common."""
     return rng.integers(0, 256, (count, width), dtype=np.uint8)
 
 
 def seen_descriptors(descriptors: Descriptors, rng: np.random.Generator) -> Descriptors:
-    """Descriptors (n,width) as another image has them."""
+    """Return the descriptors (n,width) as another image has them."""
     count, width = descriptors.shape
     if descriptors.dtype == np.uint8:
         flips: NDArray[np.uint8] = np.packbits(rng.random((count, 8 * width)) < BIT_ERRORS, axis=1)
@@ -41,7 +41,7 @@ def seen_descriptors(descriptors: Descriptors, rng: np.random.Generator) -> Desc
 
 
 def keypoint_rows(frame: SimulatedFrame, landmarks: Map, rng: np.random.Generator) -> NDArray[Any]:
-    """Rows (n,) of a cloud of keypoints: pixels, and what the map's landmarks are known by.
+    """Return rows (n,) of a cloud of keypoints: pixels, and ids or descriptors of landmarks.
 
     Outliers of the frame have the mark of a landmark and the pixel of something else, as wrong
     matches do.
@@ -64,7 +64,7 @@ def keypoint_rows(frame: SimulatedFrame, landmarks: Map, rng: np.random.Generato
 def write_keypoints(
     bag: BagWriter, camera: Camera, frame: SimulatedFrame, rows: NDArray[Any]
 ) -> None:
-    """Camera info, keypoints, and the truth at the first and the middle row."""
+    """Write camera info, keypoints, and the truth at the first and the middle row."""
     stamp_ns = frame.stamp_ns
     bag.write(CAMERA_INFO_TOPIC, make_camera_info(camera, stamp_ns), stamp_ns)
     cloud = make_cloud(make_message, stamp_ns, CAMERA_FRAME, rows)

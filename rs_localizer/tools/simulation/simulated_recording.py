@@ -23,7 +23,7 @@ TRUE_TWIST_TOPIC = "/truth/twist"
 
 
 def write_simulated(bag: BagWriter, camera: Camera, frame: SimulatedFrame | RenderedFrame) -> None:
-    """Camera info, correspondences or image, and the truth at the first and the middle row."""
+    """Write camera info, correspondences or image, and truth at first and middle row."""
     if isinstance(frame, SimulatedFrame):
         write_frame(bag, camera, frame.stamp_ns, frame.points, frame.pixels, frame.ids)
     else:
@@ -34,7 +34,7 @@ def write_simulated(bag: BagWriter, camera: Camera, frame: SimulatedFrame | Rend
 
 
 def write_truths(bag: BagWriter, frame: SimulatedFrame | RenderedFrame) -> None:
-    """Pose and twist of the camera at the first and the middle row."""
+    """Write pose and twist of the camera at the first and the middle row."""
     write_truth(bag, frame.stamp_ns, frame.first_row)
     if frame.middle_ns != frame.stamp_ns:
         write_truth(bag, frame.middle_ns, frame.middle_row)
@@ -47,7 +47,7 @@ def write_truth(
     body: str = CAMERA_FRAME,
     recorded_ns: int | None = None,
 ) -> None:
-    """Pose and twist of a body in the map, of one instant; recorded then, or at another time."""
+    """Write pose and twist of a body in the map, recorded at its time or another."""
     pose = make_message(
         "geometry_msgs/msg/PoseStamped",
         header=make_header(make_message, stamp_ns, MAP_FRAME),

@@ -41,12 +41,12 @@ RIG_FRAME = "rig"
 
 
 def optical_frame(name: str) -> str:
-    """The frame of a camera of a rig."""
+    """Return the frame of a camera of a rig."""
     return f"{name}_optical_frame"
 
 
 def make_mounts(parts: RigParts) -> Any:
-    """A tf2_msgs/TFMessage that says where the cameras are on the rig."""
+    """Return a tf2_msgs/TFMessage that says where the cameras are on the rig."""
     transforms = [
         make_transform(
             make_message, 0, RIG_FRAME, optical_frame(name),
@@ -82,7 +82,7 @@ class MountedMotion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigFrame:
-    """What one of the cameras saw at once."""
+    """Images of one of the cameras in a frame of the rig."""
 
     name: str
     stamp_ns: int  # by the camera's own clock
@@ -92,7 +92,7 @@ class RigFrame:
 def camera_stamps(
     parts: RigParts, motion: TrueMotion, rate: float, seed: int
 ) -> dict[str, list[int]]:
-    """When the first rows of each camera are exposed, in ns of true time.
+    """Return the times (ns, true) at which the first rows of each camera are exposed.
 
     Each camera runs freely, at any phase, with a rate that is off by some parts in a hundred
     thousand.
@@ -115,7 +115,7 @@ def camera_stamps(
 def simulate_rig(
     parts: RigParts, motion: TrueMotion, see: Callable[[str, TrueMotion, int], Iterable[Frame]]
 ) -> Iterator[RigFrame]:
-    """The frames of all cameras, in the order in which they have been read.
+    """Return the frames of all cameras, in the order in which they have been read.
 
     Args:
         parts: the rig; its stamps are those of true time without ``time_offset``.
@@ -136,7 +136,7 @@ def simulate_rig(
 
 
 def rig_parameters(parts: RigParts) -> dict[str, Any]:
-    """The node's parameters for a recording of the rig."""
+    """Return the node's parameters for a recording of the rig."""
     return {**node_parameters(parts), "base_frame": RIG_FRAME}
 
 
@@ -147,7 +147,7 @@ def write_rig_frame(
     image: RigFrame,
     keypoints: NDArray[Any] | None = None,
 ) -> None:
-    """Camera info and image, correspondences or keypoints of a camera, and the rig's truth.
+    """Write camera info and content of a camera, and the rig's truth.
 
     The truth is of when its first and its middle row were exposed.
     """

@@ -45,11 +45,11 @@ class TrueMotion(Protocol):
         """First and last instant of each stretch without a gap, in the order of time."""
 
     def state(self, stamp_ns: int, offsets: Array) -> TrueState:
-        """The camera at ``stamp_ns`` plus ``offsets`` (n,) seconds."""
+        """Return the camera's state at ``stamp_ns`` plus ``offsets`` (n,) seconds."""
 
 
 def sampled_states(motion: TrueMotion, spacing: float = 0.1) -> TrueState:
-    """The camera at instants ``spacing`` seconds apart, all along a motion."""
+    """Return states at instants ``spacing`` seconds apart, all along a motion."""
     states = [
         motion.state(first, np.arange(0.0, max((last - first) * 1e-9, spacing), spacing))
         for first, last in motion.intervals_ns
@@ -166,7 +166,7 @@ class _Stretch:
 
 
 def _continuous(quaternions: Array) -> Array:
-    """The same rotations without jumps between q and -q."""
+    """Return the same rotations without jumps between q and -q."""
     flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0
     signs = np.cumprod(np.concatenate([[1.0], np.where(flips, -1.0, 1.0)]))
     continuous: Array = quaternions * signs[:, None]

@@ -49,13 +49,13 @@ class TexturedPlane:
         return width * self.texel, height * self.texel
 
     def points(self, texels: Array) -> Array:
-        """Points (n,3) of the map at texel coordinates (n,2), which count from the corner."""
+        """Return points (n,3) of the map at texel coordinates (n,2), counted from the corner."""
         across, along = self.texel * np.asarray(texels, float).T
         points: Array = self.corner + across[:, None] * self.right + along[:, None] * self.down
         return points
 
     def homographies(self, rotations: Array, positions: Array) -> Array:
-        """Bearings to texels, for n cameras: (n,3,3).
+        """Return homographies (n,3,3) from bearings to texels, for n cameras.
 
         The third coordinate of ``H (a, b, 1)`` is the inverse depth of the plane along that
         bearing, negative behind the camera; the first two over it are the texel coordinates.
@@ -85,7 +85,7 @@ _GRAIN = ((1, 6.0), (4, 8.0), (32, 10.0))
 
 
 def collage(width: int, height: int, rng: np.random.Generator) -> Image:
-    """Rectangles, discs and letters of all sizes and greys over each other, with some grain.
+    """Draw rectangles, discs and letters of all sizes and greys, with some grain.
 
     The same generator state gives the same picture (height, width).
     """
@@ -156,7 +156,7 @@ class _Box:
 
 
 def three_walls(path: TrueState) -> Scene:
-    """Two walls and a floor full of markers, at right angles, in a corner before the camera.
+    """Return two walls and a floor full of markers, in a corner before the camera.
 
     The corner stands where the camera looks on average.
 
@@ -199,7 +199,7 @@ def three_walls(path: TrueState) -> Scene:
 
 
 def room(path: TrueState) -> Scene:
-    """A closed room around the path of the camera, every wall with a picture of its own."""
+    """Return a closed room around the path of the camera, every wall with its own picture."""
     box = _box(path, turned=0.0)
     low, high = box.low - _NEAR, box.high + _NEAR
     planes = []
@@ -214,7 +214,7 @@ def room(path: TrueState) -> Scene:
 
 
 def _box(path: TrueState, turned: float) -> _Box:
-    """The camera's path in axes that its mean horizontal gaze makes, turned about the vertical."""
+    """Return the box of the path, in axes of its mean horizontal gaze, turned about z."""
     gaze = path.rotations[:, :2, 2].mean(axis=0)
     angle = float(np.arctan2(gaze[1], gaze[0])) - turned
     cosine, sine = np.cos(angle), np.sin(angle)
@@ -226,7 +226,7 @@ def _box(path: TrueState, turned: float) -> _Box:
 def _marker_plane(
     pose: Pose, columns: int, rows: int, size: float, first_id: int, light: tuple[int, int]
 ) -> TexturedPlane:
-    """The paper of a grid of markers with half a gap around it."""
+    """Return the paper of a grid of markers with half a gap around it."""
     drawn = family(_FAMILY)
     side = drawn.cells * _CELL_TEXELS
     pitch = round((1.0 + _GAP) * side)
@@ -243,7 +243,7 @@ def _marker_plane(
 
 
 def printed(white: NDArray[np.bool_], light: tuple[int, int], texels: int) -> Image:
-    """The cells of a marker, each so many texels wide, in the greys of paper and ink."""
+    """Return the cells of a marker, each so many texels wide, in greys of paper and ink."""
     cells = np.where(white, *light).astype(np.uint8)
     return cells.repeat(texels, axis=0).repeat(texels, axis=1)
 
@@ -266,7 +266,7 @@ PAPER_AND_INK = (235, 26)
 
 
 def marked_room(path: TrueState) -> Scene:
-    """The room of :func:`rs_localizer.tools.simulation.walls.room` with two markers on each wall.
+    """Return :func:`rs_localizer.tools.simulation.walls.room` with two markers on each wall.
 
     Floor and ceiling have none.
     """
