@@ -20,7 +20,8 @@ PACKAGE = pages.ROOT / "rs_localizer"
 MOST_WORDS = 30
 # Rooms of the package whose docstrings still have to be rewritten: the list may only shrink.
 EXEMPT = (
-    "estimation", "inertial", "pipeline", "tools", "ros", "offline", "cli",
+    "estimation/", "inertial/", "pipeline/camera_frames.py", "pipeline/inputs.py",
+    "offline/replay.py",
 )  # fmt: skip
 # Pages that still have to be rewritten.
 EXEMPT_PAGES = ("docs/estimator.md", "docs/limits.md")
@@ -53,8 +54,8 @@ VAGUE = re.compile(r"(The same|That|Those|These|This|What|With|Such|Likewise|As)
 
 def modules() -> list[str]:
     """Files of the package that are checked, relative to it."""
-    files = (path.relative_to(PACKAGE) for path in sorted(PACKAGE.rglob("*.py")))
-    return [str(path) for path in files if path.parts[0] not in EXEMPT]
+    files = (str(path.relative_to(PACKAGE)) for path in sorted(PACKAGE.rglob("*.py")))
+    return [name for name in files if not name.startswith(EXEMPT)]
 
 
 def documented(module: str) -> Iterator[tuple[ast.AST, str, str]]:

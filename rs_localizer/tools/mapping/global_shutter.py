@@ -3,9 +3,9 @@
 """A model of COLMAP as of a global shutter, for programs that know no other shutter.
 
 Motion and the most useful points are adjusted with the rolling shutter, and all points are
-triangulated with that motion. Each keypoint is then moved to the place where a camera at the pose
-of one row of its image has the same point, along its own ray, to the depth of the point. The noise
-of a keypoint stays.
+triangulated with that motion. Each keypoint then moves along its own ray, to the depth of its
+point, to where a camera at the pose of one row of its image sees that point. The noise of a
+keypoint stays.
 """
 
 from __future__ import annotations
