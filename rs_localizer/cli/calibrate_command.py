@@ -60,7 +60,7 @@ if WORKING:
     from rs_localizer.tools.first_lens import covered, first_lens
     from rs_localizer.tools.rig_mounts import Mounted, Recording, calibrate_rig
 
-# Beside FILE.yaml, as FILE_...
+# Names of the files beside FILE.yaml, after FILE_.
 _MAP, _TRANSFORMS = "map.yaml", "transforms.launch.xml"
 Writers = dict[Path, Callable[[Path], object]]
 

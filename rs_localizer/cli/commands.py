@@ -30,7 +30,7 @@ from rs_localizer.io.atomic_files import remove_unfinished, resume_results
 from rs_localizer.process.missing import explain
 from rs_localizer.process.stopping import INTERRUPTED, StopRequest
 
-# What shells report of a program whose output nobody reads any more: 128 + SIGPIPE.
+# Exit code that shells report of a program whose output nobody reads: 128 + SIGPIPE.
 _SIGPIPE = 141
 # Characters that steer terminals: names in recordings and files may hold them.
 _STEERING = {
@@ -226,7 +226,7 @@ def _report_error(name: str, error: Exception) -> int | None:
     match error:
         case BrokenPipeError():  # nobody reads any more
             with contextlib.suppress(OSError, ValueError):
-                # What is left in the buffer would be written at the end, and fail again.
+                # Text that is left in the buffer would be written at the end, and fail again.
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return _SIGPIPE
         case ValueError() | OSError():

@@ -116,7 +116,7 @@ def detect(args: Options) -> Figures:
     return {**merged, "warnings": "; ".join(warnings)}
 
 
-# Of several cameras.
+# Worst values of several cameras.
 _WORST: dict[str, Any] = {
     "images": sum, "with_corners": sum, "corners": min, "residual_of_a_still_pose_px": max,
     "with_keypoints": sum, "keypoints": min,

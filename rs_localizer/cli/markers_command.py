@@ -25,8 +25,8 @@ if WORKING:
 # Six markers, which fill a page. Where more would be smaller than this (m), each has a page of its
 # own: smaller ones are not seen from a few metres.
 _FAMILY, _GRID, _SIZE, _SQUARE = "4x4_50", "2x3", 0.06, 0.03
-# Of a marker's size, between those of a grid; of a square, the side of a ChArUco board's marker:
-# as large as leaves the marker enough white.
+# Gap between the markers of a grid, over their size. Side of a ChArUco board's markers over its
+# squares: as large as leaves a marker enough white.
 _GAP, _MARKER = 1.0 / 3.0, 0.75
 # A print that stands: x to the right, z up, y into the wall.
 _STANDING = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])

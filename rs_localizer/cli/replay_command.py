@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from rs_localizer.cli import detect_command  # of images only
 
 _ORB_BYTES = 32  # of a descriptor; AKAZE's has 61
-# Of each of many recordings.
+# The table of each of many recordings.
 TABLE = "frames.parquet"
 
 
@@ -152,7 +152,7 @@ def _replay_one(options: Options, recording: Path, out: Path, timed: bool = True
         of_images = _detection(options, recording, matches)
         by_markers = of_images.features is None
         detect_command.detect(of_images)
-        # What was given is in the file beside the matches now, with what the video says.
+        # The given settings are in the file beside the matches now, with those of the video.
         own = matches / PARAMETERS
         alone = replace(
             options, params=own if own.exists() else None, assignments=[], rate=None,
@@ -218,7 +218,7 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
         tally = Tally(bag.count([topics.frames]), notices)
         if options.parquet is not None:
             tally.table = frame_table.FrameTable(recording, localizer, options.smooth)
-        # What a user has beside these stays.
+        # Other files of the user stay.
         names = POSES, TWISTS, BRIDGED, RESULT, fleet.MARKER, fleet.LOG
         earlier = earlier_result(options, f"{RESULT}/metadata.yaml", out, names)
         with (

@@ -99,7 +99,7 @@ def mounting_lines(name: str, first: str, mounted: Extrinsics, deviations: Array
     ]
 
 
-# What a map is made from.
+# The input that a map is made from.
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,7 +18,7 @@ def typed(executable: str, *words: str) -> str:
 
 def _program(executable: str) -> list[str]:
     in_path = shutil.which(executable)
-    # Beside the program that runs, or, of ``python -m rs_localizer``, beside Python.
+    # Look beside the running program, or, for ``python -m rs_localizer``, beside Python.
     for program in (sys.argv[0], sys.executable):
         beside = Path(os.path.abspath(program)).with_name(executable)
         if not shutil.which(str(beside)):

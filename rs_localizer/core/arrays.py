@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-# What entries of kernels take: contiguous arrays of so many dimensions.
+# Arguments of kernel entries: contiguous arrays with this number of dimensions.
 Array1 = Annotated[Array, ArrayOf("float64", 1)]
 Array2 = Annotated[Array, ArrayOf("float64", 2)]
 Array3 = Annotated[Array, ArrayOf("float64", 3)]

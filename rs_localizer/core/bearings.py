@@ -23,9 +23,9 @@ _COEFFICIENTS = 12
 _STEPS = 10
 # Squared distance, in focal lengths, from a pixel to where its bearing is seen: rounding errors.
 _SAME = 1e-24
-# Of a step: where the pixel is to be seen, and the bearing.
+# Values that a step reads: the pixel's place and the bearing.
 _PLACE = 4
-# What a step gives: a better bearing, the derivatives there and the squared distance before it.
+# Values that a step writes: a better bearing, the derivatives and squared distance before it.
 _RESULTS = 7
 
 

@@ -67,9 +67,9 @@ class LensLaw(NamedTuple):
     """
 
     counts: tuple[int, ...]  # of coefficients that it may have; 0: the lens is a pinhole
-    # Of each coefficient that calibration estimates: which power of the radius it moves points by,
-    # 0 for the lowest; None: it moves them along no radius. A single image may correct those that
-    # stand before the third power.
+    # For each coefficient that calibration estimates, the lowest power of the radius by which it
+    # moves points (0 for the lowest); None: it moves them along no radius. A single image may
+    # correct those below the third power.
     orders: tuple[int | None, ...]
     project: Callable[[Array, Array, Array], Projection]
     undistort: Callable[[Array, Array, Array], Array]
@@ -96,7 +96,7 @@ class LensLaw(NamedTuple):
 def _project(rays: Array, K: Array, D: Array) -> Projection:
     import cv2  # 16 MB, which a camera without distortion does not need
 
-    # Of a point at depth 1 the derivative by its place is that by the ray.
+    # At depth 1 the derivative by the point's x and y equals the derivative by the ray.
     bearings, zero = np.column_stack([rays, np.ones(len(rays))])[:, None], np.zeros(3)
     projected: Any = cv2.projectPoints(bearings, zero, zero, K, D)
     pixels, jacobian = projected[:2]

@@ -64,7 +64,7 @@ class ImuReason(StrEnum):
 class Notice(StrEnum):
     """Oddity that is no reason to refuse anything."""
 
-    # Of frames.
+    # Notices about frames.
     TIME_WENT_BACK = "time_went_back"
     MAP_CHANGED = "map_changed"
     CAMERA_CHANGED = "camera_changed"
@@ -82,15 +82,15 @@ class Notice(StrEnum):
     READOUT_TIME = "readout_time"
     LENS = "lens"
     EXTRINSICS = "extrinsics"
-    # Of maps and keypoints.
+    # Notices about maps and keypoints.
     MAP_REPLACED = "map_replaced"
     MAP_INCOMPLETE = "map_incomplete"
     TOO_MANY_KEYPOINTS = "too_many_keypoints"
-    # Of markers in images.
+    # Notices about markers in images.
     UNKNOWN_MARKERS = "unknown_markers"
     REPEATED_MARKERS = "repeated_markers"
     OTHER_BOARD = "other_board"
-    # Of nodes.
+    # Notices of nodes.
     NOT_BROADCAST = "not_broadcast"
     MAP_JUMPED = "map_jumped"
     CONTRADICTED = "contradicted"

@@ -86,6 +86,6 @@ def transferred(
     z = np.asarray(depths, np.float64)
     if z.shape not in ((), (len(pixels),)) or not np.all(z > 0.0):
         raise ValueError(f"depths must be one or (n,) numbers above 0, got {depths!r}")
-    # In units of the depth, which may be infinite.
+    # The shift is in units of the depth, which may be infinite.
     shift = wanted[1] - np.einsum(turn, wanted[0], rotations, translations)
     return camera.project(turned + shift / np.broadcast_to(z, len(pixels))[:, None])

@@ -20,7 +20,7 @@ one readout resolves (twice the Rayleigh spacing of cosine and sine together).""
 FUNCTIONS = 2 * len(CYCLES)
 RATES = 2.0 * np.pi * CYCLES
 """rad per unit of row time."""
-# What :func:`shake_basis` takes away of each function: its value and its rate at the middle row.
+# :func:`shake_basis` subtracts the value and the rate of each function at the middle row.
 MIDDLE_VALUES, MIDDLE_RATES = np.zeros(FUNCTIONS), np.zeros(FUNCTIONS)
 MIDDLE_VALUES[::2], MIDDLE_RATES[1::2] = 1.0, RATES
 TYPICAL_SIZES = 3e-4 / np.sqrt(CYCLES)

@@ -130,7 +130,7 @@ def carried(motion: Numbers, readouts: float, fading: float) -> tuple[Numbers, A
     """Return the motion some readout times later or earlier, and its derivative (18,18)."""
     rotation, translation, angular, linear, change, acceleration = motion
     left = math.exp(-readouts / fading)
-    # What a unit of acceleration adds to the velocity and to the way.
+    # Contribution of a unit of acceleration to the velocity and to the displacement.
     faster = -fading * math.expm1(-readouts / fading)
     farther = fading * (readouts - faster)
     angle = readouts * angular + farther * change

@@ -21,13 +21,14 @@ PARAMETERS = 18
 # Pose and velocities: what a search knows, and what ``Estimate.covariance`` is of.
 MOTION_PARAMETERS = 12
 
-# Of a step: the camera turns, moves in its own axes, and changes its velocities and accelerations.
+# Parts of a step: the camera rotates, moves in its own axes, and changes velocities and
+# accelerations.
 TURN, MOVE, ANGULAR, LINEAR, ANGULAR_ACCELERATION, LINEAR_ACCELERATION = (
     slice(k, k + 3) for k in range(0, PARAMETERS, 3)
 )
 POSE, VELOCITIES, ACCELERATIONS = slice(0, 6), slice(6, 12), slice(12, 18)
 
-# Of a state, behind the rotation.
+# Parts of a state, after the rotation.
 (
     STATE_TRANSLATION,
     STATE_ANGULAR,

@@ -22,7 +22,7 @@ from rs_localizer.native import entry
 # Readouts within which accelerations fade by exp(-1): they stay what they are.
 _NO_FADING = 1e9
 
-# Where the shaking is asked how fast it is.
+# Row times at which the rate of the vibration is sampled.
 _ROWS = np.linspace(-0.5, 0.5, 17)
 # Pixels at the rim lie a little beyond the first and the last row.
 _LAST_ROW = 0.55
@@ -61,7 +61,7 @@ class Estimate(Motion):
     declared_error: float = 0.0  # px, what map and calibration are declared to leave of it
     tracked: bool = False  # found near a prior motion, without a search
     time_ns: int = 0  # of a tracker: when the middle row was exposed
-    # How a gyroscope says that the camera turned; velocities and accelerations are those of both
+    # Rotation of the camera by a gyroscope; velocities and accelerations include it
     turn: GyroRotation | None = None
     span: float = 0.0  # s of a readout, as which row times count; 0: unknown
     # Probability that the pose lies outside its region or the map is another one; NaN: not judged
@@ -276,7 +276,7 @@ def beyond_rows(estimate: Estimate, tau: float) -> tuple[float, float]:
         unknown = abs(tau - min(max(tau, first), last))
         if unknown > 0.0:
             rates_of_turn = estimate.turn.at_rows(_ROWS)[1]
-            # Of a rate that goes on as it changes, the distance from the mean at this row.
+            # The rate goes on as it changes: mean squared distance from its mean.
             variance = float(np.mean((rates_of_turn - rates_of_turn.mean(axis=0)) ** 2))
             variance *= 3.0 * (1.0 + 2.0 * beyond) ** 2
             turn, rate = turn + variance * unknown**2, rate + variance

@@ -36,7 +36,7 @@ def refined(image: NDArray[np.uint8], corners: IntArray, levels: IntArray, step:
     reduced = image
     for level in range(int(levels.max(initial=-1)) + 1):
         if level:
-            # As ORB does, so that corners are where it places them.
+            # The sizes are ORB's, so that corners are where ORB places them.
             size = tuple(max(1, round(length / step**level)) for length in (width, height))
             reduced = np.asarray(
                 cv2.resize(reduced, size, interpolation=cv2.INTER_LINEAR_EXACT), np.uint8
@@ -105,7 +105,7 @@ _CHOICE = 4
 _SIFT_CONTRAST = 0.02
 # OpenCV takes pixel x of the doubled image for x / 2; it is (x + 0.5) / 2 - 0.5.
 _SIFT_OFFSET = -0.25
-# What COLMAP multiplies the square roots with, so that they fill a byte.
+# COLMAP's factor for the square roots, which fills a byte.
 _SIFT_SCALE = 512.0
 # Steps of brightness around a corner; ORB-SLAM (Mur-Artal et al., T-RO 2015) takes 20, or 7.
 _FAST_THRESHOLD = 10
@@ -277,7 +277,8 @@ class FeatureExtractor:
             rows = self._choose(detected, image)
             detected = [detected[row] for row in rows]
             if not self._method.at_once:
-                # Some are too near the rim, and others change their places.
+                # Some keypoints are too near the rim and are dropped, and others change their
+                # places.
                 detected, descriptors = self._detector.compute(image, detected)
             elif descriptors is not None:
                 descriptors = descriptors[rows]

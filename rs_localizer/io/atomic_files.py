@@ -22,7 +22,7 @@ from pathlib import Path
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM)
 _UNFINISHED = ".unfinished-"
-# In a workplace, beside what is made: the journal; what the names stood for before; the lock.
+# Files of a workplace beside the results: the journal, the earlier results, the lock.
 _JOURNAL, _OLD, _LOCK = ".journal", ".old", ".lock"
 # A disk of its own (ext4) has this from the start.
 _OF_DISK = "lost+found"
@@ -77,7 +77,7 @@ def atomic_files(*files: Path) -> Iterator[tuple[Path, ...]]:
         OutputError: when the disk takes no more, naming the first of them.
     """
     finals = [file.resolve() for file in files]
-    # What is there and no file, such as /dev/stdout, is written to as it is.
+    # An existing path that is no file, such as /dev/stdout, is written to directly.
     ordinary = [file for file in finals if file.is_file() or not file.exists()]
     with contextlib.ExitStack() as stack, write_errors(files[0]):
         workplaces = {
@@ -229,7 +229,7 @@ def _lock(work: Path, wait: bool) -> int:
         except OSError as error:
             if not wait or error.errno not in _UNSUPPORTED:
                 raise
-        # Who had it before may have removed it.
+        # Its last owner may have removed it.
         if not os.path.samestat(os.fstat(lock), os.stat(work / _LOCK)):
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(work))
     except BaseException:

@@ -44,8 +44,8 @@ from rs_localizer.io.reading import load_yaml, read_text
 from rs_localizer.io.topics import TF_STATIC
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
-# Whoever plays a recording offers its topics as it says; on /tf_static everybody listens for what
-# was said before.
+# Players advertise topics with the QoS recorded in the bag; subscribers to /tf_static expect
+# transient-local durability.
 _NO_LIMIT = QosTime(2**31 - 1, 10**9 - 1)
 _LATCHED = Qos(
     QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,

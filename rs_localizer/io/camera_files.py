@@ -35,7 +35,7 @@ _ORDER = {
     "equidistant": ("k1", "k2", "k3", "k4"),
 }
 _RATIONAL = len(_ORDER["rational_polynomial"])
-# What programs call the models.
+# Names of the models in other programs.
 _MODELS = {
     "fisheye": "equidistant", "opencv_fisheye": "equidistant",
     "radtan": "plumb_bob", "pinhole": "plumb_bob", "none": "plumb_bob",
@@ -44,7 +44,7 @@ _MODELS = {
 }  # fmt: skip
 
 
-# What ROS, OpenCV's programs and their users call the parts of a lens.
+# Names of the parts of a lens in ROS, in OpenCV's programs and in users' files.
 _K = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "mtx")
 _D = (
     "distortion_coefficients", "Distortion_Coefficients", "distortion_coeffs", "dist_coeffs",
@@ -59,7 +59,7 @@ CALIBRATION_KINDS = (
     "calibration file of ROS' camera_calibration, OpenCV (YAML, JSON), Kalibr (camchain), COLMAP "
     "(cameras.txt), Gyroflow, or JSON with K, D, width and height"
 )
-# Who writes FILE#cam1 means a camera in a file; a name of a file may hold the sign, too.
+# FILE#cam1 is a camera in a file; the name of a file may hold the sign, too.
 _CHOICE = re.compile(r"(.+)#([^/#]+)")
 
 
@@ -360,7 +360,7 @@ def lens_parameters(camera: Camera) -> dict[str, Any]:
         "image_height": camera.height,
         "distortion_model": str(camera.distortion_model),
         "camera_matrix": camera.K.ravel().tolist(),
-        # Of an empty list ROS could not tell what it holds.
+        # ROS cannot infer the type of an empty list.
         "distortion_coefficients": camera.D.tolist() or [0.0] * camera.law.counts[-1],
     }
 

@@ -96,7 +96,7 @@ def read_camera_info(message: Any) -> Calibration:
     return found
 
 
-# What drivers call the models besides.
+# Other names of the models in drivers.
 _NAMES = {
     "fisheye": "equidistant", "kannala_brandt": "equidistant", "kannala_brandt4": "equidistant",
     "plumb bob": "plumb_bob", "radtan": "plumb_bob", "brown_conrady": "plumb_bob",

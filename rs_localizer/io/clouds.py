@@ -25,7 +25,7 @@ _NAMES = dict(
     zip(_FORMATS, "INT8 UINT8 INT16 UINT16 INT32 UINT32 FLOAT32 FLOAT64".split(), strict=True)
 )
 _NUMBERS = {np.dtype(code): number for number, code in _FORMATS.items()}
-# What each known field may hold; a name means the same in every cloud.
+# Types that each known field may have; a name means the same in every cloud.
 _TYPES = dict.fromkeys(("x", "y", "z", "u", "v", "score"), (7, 8)) | {
     "id": (1, 2, 3, 4, 5, 6),
     "descriptor": (2, 7),

@@ -32,7 +32,7 @@ METADATA = "metadata.yaml"
 ZSTD = b"\x28\xb5\x2f\xfd"
 _MCAP, _SQLITE, _BAG = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"#ROSBAG V2.0"
 _SUFFIX = {_MCAP: ".mcap", _SQLITE: ".db3", _BAG: ".bag"}
-# In a folder these are not looked into: there may be a hundred thousand.
+# Files in a folder that are not opened: there may be a hundred thousand.
 _OTHERS = (".jpg", ".jpeg", ".png", ".yaml", ".txt", ".csv", ".json", ".mp4")
 
 
@@ -194,7 +194,7 @@ def _most_at_a_time(chunks: Iterable[tuple[int, int, int, int]]) -> tuple[int, i
 
 # -- decompressors with a limit -----------------------------------------------------------------
 
-# Of whole files, which go to the disk.
+# Limit of a whole unpacked file, which goes to the disk.
 _FILE_ALIKE = 2**28
 _STEP = 2**20
 _WITH_QOS = (

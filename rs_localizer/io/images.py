@@ -68,12 +68,12 @@ _FORMATS = (("JPEG", b"\xff\xd8", b"\xff\xd9"), ("PNG", b"\x89PNG\r\n\x1a\n", b"
 _DENSEST, _ALIKE = 32, 4_000_000
 MOST_PIXELS = 150_000_000
 """No camera has more pixels; a decoded pixel takes 8 bytes at most."""
-# What a gray image depends on; PNG (third edition), section 5.6.
+# Chunks that a grey image depends on; PNG (third edition), section 5.6.
 _STILL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 # JPEG's markers of frames, by which the size is given.
 _FRAME_HEADERS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 _ALONE = {0x01, *range(0xD0, 0xD8)}  # all other markers of JPEG are followed by their length
-# Of pixels with 16 bits: so many tell the range, and these percentiles of them bound it.
+# The range of 16-bit pixels is taken from this many, between these percentiles.
 _LOOKED_AT, _RANGE = 100_000, (0.1, 99.9)
 _LEVELS = 64  # of eight bits, that an image needs
 # Raw rows: a camera's note that the picture should be shown upright turns the shutter, too.

@@ -27,7 +27,7 @@ class ImuRecording:
 # a message counts in other units.
 _FASTEST = 100.0  # rad/s
 _HARDEST = 5000.0  # m/s^2
-# What a covariance says in its first element where the message holds no such measurement.
+# First element of a covariance if the message holds no such measurement.
 _ABSENT = -1.0
 
 

@@ -31,7 +31,8 @@ _MOST_VALUES, _MOST_JSON, _DEEPEST = 100_000, 1_000_000, 50
 _MOST_CHARACTERS = 2_000_000
 # Characters of a file, of which JSON alone uses so many; /dev/zero and some pipes never end.
 _LONGEST = 20_000_000
-# Of numbers; those of base 60 ("1:0:0 ...", YAML 1.1) take time that grows with its square.
+# Longest text of a number; numbers of base 60 ("1:0:0 ...", YAML 1.1) take time that grows with its
+# square.
 _LONGEST_NUMBER = 100
 
 
@@ -156,16 +157,15 @@ def most_unpacked(packed: int) -> int:
 
 # -- libraries that are not to be trusted with any file ------------------------------------------
 
-# In a process of its own a script is run by its path; it imports nothing of this package, takes a
-# task and leaves arrays. What it allocates, how long it works, and how it dies is then nobody
-# else's fault.
+# The script runs by its path in a process of its own. It imports nothing of this package, takes a
+# task and leaves arrays, so that its memory, its time and its crash harm nobody else.
 _START = (
     "import resource as r, runpy, sys; memory, seconds = map(int, sys.argv[1:3]); "
     "limits = {r.RLIMIT_DATA: memory, r.RLIMIT_CPU: seconds, r.RLIMIT_CORE: 0}; "
     "[r.setrlimit(kind, (most, most)) for kind, most in limits.items()]; "
     "sys.argv = sys.argv[3:]; runpy.run_path(sys.argv[0], run_name='__main__')"
 )
-# Of a machine whose cores are busy: s for each second of work.
+# Longest wait (s) for each second of work, on a machine whose cores are busy.
 _WAITING = 10
 _LONGEST_WORDS = 300
 

@@ -25,12 +25,12 @@ from rs_localizer.io.reading import LimitedError, run_limited
 
 # Optical axes (x right, y down, z forward) from telemetry-parser's.
 CAMERA_FROM_SENSOR = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-# What announces telemetry in the first or the last bytes of a file: GoPro, DJI, Sony, Insta360.
+# Marks of telemetry in the first or the last bytes of a file: GoPro, DJI, Sony, Insta360.
 _MARKS = (b"gpmd", b"djmd", b"rtmd", b"8db42d694ccc418790edff439fe026bf")
 _LOOKED_AT = 2**18  # bytes
 _MOST_TRACKS = 2**26  # bytes, for a file that lies: a day at 60 Hz
 _SCRIPT = Path(__file__).with_name("telemetry_process.py")
-# Of the process: bytes beside so many for each byte of the file, and s beside a slow disk's.
+# Limits of the process: memory in bytes, beside this many for each byte of the file, and time (s).
 _MEMORY, _A_BYTE, _MOST_MEMORY = 400_000_000, 4, 6_000_000_000
 _SECONDS, _BYTES_A_SECOND = 5, 50_000_000
 # Gyroscopes end at 70 rad/s (4000 deg/s); readout times of cameras at 0.2 s.

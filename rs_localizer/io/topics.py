@@ -28,7 +28,7 @@ POSE_WITH_COVARIANCE = "pose_with_covariance"
 TWIST_WITH_COVARIANCE = "twist_with_covariance"
 ODOMETRY = "odometry"
 INLIERS = "inliers"
-# Of the node alone, and their types.
+# Outputs that only the live node has, and their types.
 INTEGRITY, MAP_MARKERS, CAMERA_MARKER = "integrity", "map_markers", "camera_marker"
 MAP_TO_ODOM = "map_to_odom"
 LIVE = {
@@ -38,7 +38,7 @@ LIVE = {
     CAMERA_MARKER: "visualization_msgs/msg/MarkerArray",
 }
 DEBUG_IMAGE = "debug_image"
-# Of everybody.
+# Topics of ROS itself.
 TF = "/tf"
 TF_STATIC = "/tf_static"
 DIAGNOSTICS = "/diagnostics"

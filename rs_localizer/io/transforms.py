@@ -20,7 +20,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.io.messages import Make, make_header, make_quaternion, make_vector
 from rs_localizer.io.messages import stamp_ns as stamp_of
 
-# How far the squared norm of a quaternion may be from one; tf2 ignores those that are farther.
+# Tolerance of a quaternion's squared norm; tf2 ignores those that are farther from one.
 _NORM_TOLERANCE = 1e-2
 
 

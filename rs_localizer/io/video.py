@@ -135,8 +135,8 @@ class Video:
                 read, color = video.read()
                 if not read:
                     return
-                # Of the image just read. OpenCV 4.6 says 0 for those last images that a decoder
-                # with B frames holds back, and for all images of a raw stream.
+                # Time of the image just read. OpenCV 4.6 returns 0 for the last images that a
+                # decoder with B frames holds back, and for all images of a raw stream.
                 seconds = 1e-3 * float(video.get(cv2.CAP_PROP_POS_MSEC))
                 is_new = seconds > last
                 last = max(last, seconds)

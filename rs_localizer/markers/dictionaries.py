@@ -21,8 +21,9 @@ from rs_localizer.markers.families import Family
 
 Gray = NDArray[np.uint8]
 
-# Before OpenCV 4.10, of candidates that are nearer than this (of the perimeter) the outer one wins.
-# At the default of 0.05, a white rim of one cell before a darker wall hides the marker in it.
+# Before OpenCV 4.10, the outer one of two candidates wins if they are nearer than this share of the
+# perimeter. At the default of 0.05, a white rim of one cell before a darker wall hides the marker
+# in it.
 _NEAREST = 0.02
 
 _aruco: Any = getattr(cv2, "aruco", None)
@@ -81,8 +82,8 @@ class MarkerFinder:
 
 def _configured(parameters: Any, family: Family) -> Any:
     parameters.markerBorderBits = family.border
-    # Of OpenCV's own refinements, the AprilTag one is off by 0.46 px along x and y, and the
-    # sub-pixel search moves the corners of a blurred marker inward by 0.1 to 0.4 px.
+    # OpenCV's refinements are not used: the AprilTag one is off by 0.46 px along x and y, and the
+    # sub-pixel search moves the corners of a blurred marker inwards by 0.1 to 0.4 px.
     parameters.cornerRefinementMethod = _aruco.CORNER_REFINE_NONE
     if not hasattr(parameters, "minGroupDistance"):
         parameters.minMarkerDistanceRate = _NEAREST

@@ -147,10 +147,11 @@ _POINTS = (12, 32)
 # on beyond it, it is made longer, up to a whole cell.
 _HALF_CELLS = 0.6
 _HALF_LEAST, _HALF_MOST, _LONGER = 1.5, 3.5, 1.5
-# What a sharp edge has from the pixels and from reading between them: variance (px^2) and width
-# from foot to top (px). A rise is whole if it is not wider than this share of a cell.
+# A sharp edge has this variance (px^2) from the pixels and from sampling between them, and this
+# width (px) from foot to top. A rise is whole if it is not wider than this share of a cell.
 _SHARP_VARIANCE, _SHARP_WIDTH, _WHOLE = 0.4, 2.0, 0.9
-# Of one that is not, this share of the way from black to white, to either side of its middle.
+# For an edge that is not whole, this share of the way from black to white counts, to either side of
+# its middle.
 _AROUND = 0.3
 # Parts of a side next to its ends are left out, where the next side is mixed in: as a share, and
 # in px across that side, beside half of what motion smears it; never more than so much.

@@ -21,8 +21,8 @@ from rs_localizer.markers.poses import Pose, finite
 _SQUARE_TOLERANCE = 0.05
 # No camera sees more.
 _MOST_SQUARES = 200
-# Of a printed board whose shape nobody measured, a corner is off by this part of its distance from
-# the middle: 0.2 mm in 10 cm, as paper on a wall or a clipboard bends.
+# Corners of a printed board whose shape was not measured are off by this share of their distance
+# from the middle: 0.2 mm in 10 cm, as paper on a wall or a clipboard bends.
 _PAPER = 0.002
 
 _UNIT_SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])

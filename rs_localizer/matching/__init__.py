@@ -128,7 +128,7 @@ class _RealIndex(Index):
         queries = np.asarray(queries, np.float32)
         result = Nearest.none(len(queries))
         block = max(1, _MOST_PRODUCTS // len(self._rows))
-        # What overflows is far away, or nowhere.
+        # Points that overflow are far away, or nowhere.
         with np.errstate(over="ignore", invalid="ignore"):
             for start in range(0, len(queries), block):
                 part = slice(start, start + block)
@@ -371,7 +371,8 @@ class Matcher:
         if len(queries):
             firsts = nearest.landmarks[:, 0]
             there = np.flatnonzero(firsts >= 0)
-            # As the map's: its bytes are bits, those of keypoints may stand for numbers.
+            # Descriptors are read as the map's: its bytes are bits, those of keypoints may stand
+            # for numbers.
             index = make_index(queries, binary=self.map.descriptors.dtype == np.uint8)
             back = index.nearest(self.map.descriptors[firsts[there]])
             owners[there] = back.landmarks[:, 0]
@@ -438,7 +439,8 @@ def _accepted(nearest: Nearest, owners: IntArray, rows: IntArray, ratio: float) 
     first, second = nearest.distances[:, 0], nearest.distances[:, 1].copy()
     rivals = np.isfinite(second)
     if np.any(rivals):
-        # Where nothing else competes, nearer than others' second ones is near.
+        # If no other landmark competes, the second-best distance is the median one of other
+        # keypoints.
         second[~rivals] = np.median(second[rivals])
     with np.errstate(invalid="ignore"):  # infinite against infinite: nothing there
         good = (first < ratio * second) & (owners == np.arange(len(first)))

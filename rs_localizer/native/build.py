@@ -33,7 +33,7 @@ ASSEMBLED = Path(__file__).resolve().parent / "assembled"
 _HERE = Path(__file__).resolve().parent
 _CPUS = {"v2": "x86-64-v2", "v3": "x86-64-v3", "v4": "x86-64-v4", "generic": "generic"}
 _MACHINES = {level: machine for machine, known in levels.LEVELS.items() for level in known}
-# Of manylinux_2_28, the oldest glibc that wheels run on.
+# glibc of manylinux_2_28, the oldest one that wheels run on.
 _GLIBC = "2.28"
 _FLAGS = (
     "-O3",

@@ -51,7 +51,7 @@ class _CompiledKernel(CPUDispatcher):
 class _CompiledEntry(CPUDispatcher):
     """A kernel that Python calls: with what it declares, and nothing else."""
 
-    # Of one that was unpickled in another process, too.
+    # Declaration, also of an entry that was unpickled in another process.
     declared: Declaration | None = None
     native: Callable[..., Any] | None = None
 
@@ -196,7 +196,7 @@ def is_ours(path: Path) -> bool:
             about = each.stat()
         except FileNotFoundError:  # it will be made for this user
             continue
-        # In /tmp (sticky), nobody can replace what is another's.
+        # In a sticky folder such as /tmp nobody can replace another user's files.
         is_sticky = each != path and about.st_mode & stat.S_ISVTX
         if about.st_uid not in {0, os.geteuid()} or (about.st_mode & _OTHERS and not is_sticky):
             warnings.warn(

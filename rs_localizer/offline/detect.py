@@ -37,14 +37,14 @@ from rs_localizer.pipeline.what_fits import Mistakes, of_refused
 _LEAST_CORNERS = 6
 # Fewer than this share of the images with anything of the map are a reason to tell.
 _FEW = 0.3
-# So many images without anything of the map are no chance: a few seconds of a video.
+# After this many images without the map, a few seconds of a video, chance is excluded.
 _PATIENCE = 64
 # Corners of two markers: the least that is left of three.
 _LEAST_INLIERS = 8
 # A global-shutter pose leaves at most so much (px rms) in the stillest images, in percent of all,
 # unless calibration or map are wrong: a good one leaves 0.1 to 0.5.
 _MOST_STILL, _STILL_PERCENT = 1.5, 10.0
-# So many images of another size than the calibration's are no stray ones, if none fits it.
+# If none fits, this many images of another size than the calibration's are no stray ones.
 _MISFITS = 3
 
 

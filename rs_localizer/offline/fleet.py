@@ -127,7 +127,7 @@ def perform(task: Task) -> Outcome:
     if (figures := finished(task)) is not None:
         return figures
     try:
-        # What is there is of other settings.
+        # The existing result has other settings.
         with atomic_directory(task.folder, content(task.folder)) as inner:
             with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
                 try:

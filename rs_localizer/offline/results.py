@@ -130,7 +130,7 @@ def write_frame(
         writer.write(TF, writer.make(TF_TYPE, transforms=[transform]), recorded_ns)
 
 
-# Of each frame with a pose.
+# Numbers of each frame with a pose.
 _COLUMNS = (*("residual", "model_error", "inliers", "points", "tracked", "dropped", "twist"),)
 
 

@@ -57,7 +57,7 @@ def oddities(cloud: Correspondences, camera: Camera, camera_frame: str) -> dict[
     return notices
 
 
-# So many landmarks are named.
+# Most landmarks that are named.
 _NAMED = 12
 
 

@@ -142,7 +142,7 @@ class FrameLocalizer(ABC):
         return True
 
     def _apply_settings(self, config: NodeConfig) -> None:
-        # Nothing changes if this raises: cameras, tracker and settings always belong together.
+        # If this raises, nothing changes: cameras, tracker and settings always belong together.
         cameras = {
             name: self.calibrations.get(name, ANY_CALIBRATION).camera(
                 own.readout_time, own.scan_direction

@@ -23,7 +23,7 @@ from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.transforms import Transform, TransformError, Transforms, from_numbers
 from rs_localizer.pipeline.refusal import Notify
 
-# What a variance of zero means: RViz leaves those of z, roll and pitch so. m, rad.
+# Deviations (m, rad) that a variance of zero stands for: RViz leaves z, roll and pitch at zero.
 _UNSAID = (0.1, 0.05)
 # Nobody knows a pose better beforehand than it is worth: m, rad.
 _LEAST = (0.01, 0.005)

@@ -26,8 +26,8 @@ from rs_localizer.io.transforms import TransformError, Transforms
 from rs_localizer.pipeline.refusal import IMU_REASONS, Notify
 from rs_localizer.tracking import Tracker
 
-# Beside the exposure: the spline through the readings wants neighbours, and the tracker those since
-# the last frame.
+# Readings around the exposure are used, because the spline needs neighbours, and the tracker needs
+# those since the last frame.
 _AROUND_NS, _BEFORE_NS = 10_000_000, 600_000_000
 # Drivers send readings in bundles: those of so much time (s) may come at once.
 _BUNDLE = 0.05

@@ -43,8 +43,8 @@ from rs_localizer.pipeline.carried_pose import (
 _GATES = {3: 21.1, 6: 27.9}
 _DOUBTFUL = 0.5  # a pose that is more probably wrong than right is no evidence
 _CLEARLY = 9.0  # twice the logarithm of ninety to one, against the hypothesis that has more poses
-# Who carries a robot walks, m/s, and turns, rad/s; what is beyond that has to be noise, by two
-# deviations at most.
+# A person who carries a robot walks (m/s) and turns (rad/s) at most this fast. Faster motion has to
+# be noise, of at most two deviations.
 _PACE, _SPIN, _SLACK = 1.5, 3.0, 4.0
 # s of agreement that a hypothesis needs to be believed, and to be told as a contradiction; what a
 # pose adds at most; s for which poses of which nothing followed are remembered.
@@ -167,7 +167,7 @@ class _Case:
         if held is None:
             return replace(state, held=found, aside=None, base=found.pose) if right else state, ""
         ours, theirs = self._misfit(held, found), self._misfit(aside, found)
-        # What has grown for long explains much, and a sharper hypothesis better.
+        # A hypothesis that has grown for long explains much, but a sharper one explains it better.
         likelier = ours[1] <= theirs[1] + (-_CLEARLY if aside and aside.told else _CLEARLY)
         if self._passes(ours) and (likelier or not self._passes(theirs)):
             if not right:

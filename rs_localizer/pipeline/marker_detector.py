@@ -87,7 +87,7 @@ class FrameDetector:
         self._detector = MarkerDetector(marker_map, _LEAST_SIDE)
         self._row = _row_type(marker_map.points)
 
-        # What is wrong with all images, as a sentence; empty: unknown.
+        # Fault of all images, as a sentence; empty: unknown.
         self.mistake = ""
         self._mistakes = Mistakes()
 

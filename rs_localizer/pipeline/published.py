@@ -164,7 +164,7 @@ def of_body(
     base = config.base_frame
     if base in ("", localized.body_frame):
         return localized
-    # Who gives no time gets the latest, as everywhere in TF.
+    # Without a time the latest transform is used, as everywhere in TF.
     timed = min(localized.input_stamp_ns, localized.stamp_ns) > 0
     stamp_ns = localized.stamp_ns if timed else None
     span_ns = round(localized.estimate.span * 1e9) if localized.twist else 0

@@ -20,15 +20,15 @@ from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse
 # The order of corners is held against the map until so many images of two or more tags agree, then
 # in one image of so many.
 _AGREED, _ONE_IN = 20, 30
-# In which other order our four corners may be.
+# Other orders in which our four corners may be given.
 _ORDERS = [
     [(first + step * k) % 4 for k in range(4)]
     for step in (1, -1)
     for first in range(4)
     if (first, step) != (0, 1)
 ]
-# How far corners are from where a homography has them, in sides: in the right order (also those of
-# a fisheye lens, of two neighbours), and in a wrong one.
+# Distance of corners from their places by a homography, in sides: in the right order (also of a
+# fisheye lens, of two neighbours), and in a wrong one.
 _FITS, _MISFITS = 0.1, 0.25
 _CORNERS = ("upper left", "upper right", "lower right", "lower left")  # ours
 _SHOWN = 8  # names in a sentence

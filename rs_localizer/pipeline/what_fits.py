@@ -24,14 +24,14 @@ REASONS = frozenset({
 })  # fmt: skip
 """Reasons of refusals that such a mistake may have."""
 
-# Of the points: what is wrong with all of them alike has no outliers but those of any frame.
+# Least share of inliers: a fault that all points share leaves only the outliers of any frame.
 _MOST = 0.7
 # Single frames are refused for many reasons: one in ever so many times more is tried, so that a day
 # of refusals costs some ten tries.
 _RARER = 4
 # Frames that say the same: one may fit by chance.
 _AGREED = 2
-# Of their extent, how far points are beside a plane.
+# Points are flat if they lie within this share of their extent.
 _FLAT = 0.02
 # Frames of a recording.
 _TRIED = 5
@@ -65,7 +65,7 @@ def _half_turned(frame: _Frame) -> Array | None:
     return np.where(whole[:, None], frame.pixels[opposite], np.nan) if whole.any() else None
 
 
-# What is to be done, and how.
+# Corrections by name, and the functions that apply them.
 _MISTAKES: dict[str, Callable[[_Frame], Array | None]] = {
     "pixels are mirrored left to right: the sender mirrors them (or the map is left-handed)":
         _left_right,

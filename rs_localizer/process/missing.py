@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sentence on a package that is not installed, with the command that brings it."""
 
-# By the name that is imported: Ubuntu's package, and pip's where Ubuntu 24.04 has none.
+# Ubuntu's package for each imported name, and pip's where Ubuntu 24.04 has none.
 _UBUNTU = {
     "PIL": "python3-pil",
     "cv2": "python3-opencv",
@@ -20,7 +20,7 @@ setup.py reads them here; tests hold the pages against them.
 _ASKED = " ".join(f'"{name}{versions}"' for name, versions in BOUNDS.items())
 BESIDE_ROS = f'pip install --break-system-packages {_ASKED} "numpy<2"'
 """Beside the ROS of Ubuntu 24.04, which has neither, and whose NumPy this keeps."""
-# Of what only some commands need: the extra that brings it.
+# Extras that bring packages which only some commands need.
 _EXTRAS = {
     "av": "video",
     "dask": "fleet",
@@ -41,7 +41,7 @@ _PIP = {
 def explain(error: ImportError) -> str:
     """Return the sentence that explains an import that failed."""
     name = (error.name or "").partition(".")[0]
-    # What is there and broken (built for another NumPy, say) tells of itself.
+    # A package that is there but broken (built for another NumPy, for example) reports itself.
     if not isinstance(error, ModuleNotFoundError):
         return f"{_one_line(error)}; a package it needs is installed and cannot be imported"
     if name in _UBUNTU:

@@ -15,7 +15,8 @@ from types import FrameType
 from typing import ClassVar, Self
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-# What shells report of a program that a signal ended: 130 for Ctrl-C, 143 for SIGTERM.
+# Base of the exit code that shells report of a program that a signal ended: 130 for Ctrl-C, 143 for
+# SIGTERM.
 _SIGNALLED = 128
 INTERRUPTED = _SIGNALLED + signal.SIGINT
 """Exit code after Ctrl-C."""

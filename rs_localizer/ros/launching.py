@@ -36,7 +36,7 @@ Texts = Mapping[str, str]
 
 # Drivers by their package, and their executables; both publish image_raw and camera_info.
 DRIVERS = {"v4l2_camera": "v4l2_camera_node", "usb_cam": "usb_cam_node_exe"}
-# Of a launch file that starts from a camera: names, defaults and what they are.
+# Arguments of a launch file that starts from a camera: names, defaults and descriptions.
 CAMERA = {
     "camera": ("", f"driver to start: {' or '.join(DRIVERS)}; not given: one that runs already"),
     "calibration": ("", "URL of the camera's calibration, for the driver"),

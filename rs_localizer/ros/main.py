@@ -17,8 +17,8 @@ from rs_localizer.process.stopping import StopRequest
 _HELP, _VERSION = ("-h", "--help"), ("--version",)
 _ROS_ARGUMENTS = "--ros-args"  # what follows is for ROS
 
-# Of each executable: the class of its node or its function below rs_localizer.ros, the name of a
-# node with settings, and what it does.
+# For each executable, the class of its node or its function below rs_localizer.ros, the name of a
+# node with settings, and a description.
 _PROGRAMS = {
     "localizer": (
         "localizer.node.LocalizerNode",
@@ -95,7 +95,7 @@ def _run(name: str, args: list[str] | None = None) -> int:
                 if text is not None:
                     sys.stdout.write(text)
                     return 0
-                # What takes long.
+                # The imports that follow take long.
                 path, node, _ = _PROGRAMS[name]
                 module, _, kind = path.rpartition(".")
                 make = getattr(importlib.import_module(f"rs_localizer.ros.{module}"), kind)

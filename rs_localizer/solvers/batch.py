@@ -26,7 +26,8 @@ from rs_localizer.native import entry, kernel
 
 MODEL_SIZE = 18
 
-# Of v and w together, rad: a millionth of a pixel, and above the rounding of most samples.
+# Largest step of v and w together, rad, of a converged sample: a millionth of a pixel, and above
+# the rounding of most samples.
 _CONVERGED = 1e-9
 
 

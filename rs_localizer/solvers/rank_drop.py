@@ -49,7 +49,7 @@ def _times(a: Exponents, b: Exponents) -> Exponents:
 _Y = (0, 1, 0)
 _CUBICS = _monomials(3)
 _BASIS = [m for degree in range(4) for m in _monomials(degree)]
-# Those up to degree d come first, for every d; the ten multiples of y come last.
+# Monomials up to degree d come first, for every d; the ten multiples of y come last.
 _ALL = [*_BASIS, *(m for m in _monomials(4) if m[1] == 0), *(_times(_Y, m) for m in _CUBICS)]
 _PLANAR = [m for degree in (3, 2, 1, 0) for m in _monomials(degree) if m[1] == 0]
 
@@ -101,7 +101,8 @@ def _expand(size: int) -> Any:
 _TERMS_2, _TERMS_3, _TERMS_4 = _terms(2), _terms(3), _terms(4)
 _expand_2, _expand_3, _expand_4 = _expand(2), _expand(3), _expand(4)
 
-# Where the work array holds the minors of two, of three, of four rows, and what makes up one.
+# Places in the work array of the minors of two, three and four rows, and of the operands of one
+# minor.
 _PAIRS = 0
 _TRIPLES = _PAIRS + len(_TERMS_2) * _COUNT[2]
 _QUARTICS = _TRIPLES + len(_TERMS_3) * _COUNT[3]

@@ -25,7 +25,7 @@ from rs_localizer.io.reading import LimitedError, run_limited
 
 _SCRIPT = Path(__file__).with_name("colmap_process.py")
 _FILES = ("cameras", "images", "points3D")
-# Of the process: bytes beside so many for each byte of the files, and s beside what they need.
+# Limits of the process: memory in bytes, beside this many for each byte of the files, and time (s).
 _MEMORY, _A_BYTE = 1_000_000_000, 40
 _SECONDS, _BYTES_A_SECOND = 30, 1_000_000
 _NO_POINT = -1

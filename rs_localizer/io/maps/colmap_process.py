@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 _NO_POINT = 2**64 - 1
-# Of a track, evenly: some are seen a thousand times.
+# Descriptors that are read per track, evenly chosen: some landmarks are seen a thousand times.
 _MOST_OBSERVATIONS = 32
 _SIFT_WIDTH = 128
 # Extractors of COLMAP 3.12 and later; before, there was no such column.
@@ -83,7 +83,7 @@ def describe(found: dict[str, Any], database: str) -> dict[str, Any]:
         for image in np.unique(tracks[:, 0]).tolist():
             row = file.execute(query, (image,)).fetchone()
             rows, data, extractor = row or (0, b"", _SIFT)
-            # Of all extractors but SIFT, which is the first, COLMAP keeps the bytes of floats.
+            # For all extractors but SIFT, the first one, COLMAP stores the bytes of floats.
             kind_of = np.uint8 if extractor in (_UNDEFINED, _SIFT) else np.dtype("<f4")
             if rows:
                 per_image[image] = np.frombuffer(data, kind_of).reshape(rows, -1)

@@ -25,13 +25,14 @@ from rs_localizer.io.maps.landmarks import Map, MapError, make_map
 
 SUFFIX = ".npz"
 _ARRAYS = ("points", "ids", "descriptors", "covariances", "error_modes")
-# Of all arrays together, as floats of 8 bytes: ten million landmarks with 128 bytes each, say.
+# Limit of all arrays together, as floats of 8 bytes: for example ten million landmarks with 128
+# bytes.
 _MOST_BYTES = 2 * 2**30
 # Maps hold measured numbers, which deflate packs no better than this beside some bytes of zeros.
 _BEST_PACKING, _ZEROS = 20, 2**25
 _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _LONGEST_HEADER = 10_000
-# What zipfile, zlib and NumPy raise for damaged files.
+# Exceptions that zipfile, zlib and NumPy raise for damaged files.
 _DAMAGES = (
     zipfile.BadZipFile, zlib.error, struct.error, EOFError, NotImplementedError, RuntimeError,
     ValueError, KeyError, OverflowError, SyntaxError, TypeError, OSError, tokenize.TokenError,

@@ -59,7 +59,7 @@ def judge(summary: Summary, silence: Mapping[str, Silence], oddities: Mapping[st
 
 # Types of the topics whose messages are looked at.
 _IMAGES = {IMAGE: ImageMessage, COMPRESSED_IMAGE: CompressedImage}
-# How often the node looks whether somebody listens, in s.
+# Interval (s) at which the node checks for subscribers.
 _LOOK_PERIOD = 0.2
 
 Settings = TypeVar("Settings", DetectorConfig, FeatureConfig)

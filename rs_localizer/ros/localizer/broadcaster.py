@@ -63,7 +63,7 @@ class Broadcaster:
         self._config: NodeConfig | None = None
         self._rivals = Rivals()
         self._sending = threading.Lock()  # of the next ones
-        # What waits for odometry, with when it is given up, time.monotonic().
+        # Calls that wait for odometry, and the time.monotonic() at which each is given up.
         self._pending: deque[tuple[Callable[[bool], None], float]] = deque(maxlen=_MOST_PENDING)
         self._state, self._map_frame = CorrectionState(), ""
         self._decision: Decision | None = None

@@ -65,7 +65,7 @@ from rs_localizer.settings import NODE_NAME
 
 # Inputs whose QoS has parameters, as that of ~/pose has.
 _OVERRIDABLE = (CORRESPONDENCES, KEYPOINTS, IMU)
-# What output_rate publishes.
+# Outputs that output_rate publishes.
 _MOTION = tuple(name for name in TYPES if name != INLIERS)
 # Notices that the diagnostics repeat: frames are localized, and probably not as they should be.
 _ODD = (

@@ -18,7 +18,8 @@ from rs_localizer.pipeline.published import Broadcast
 
 # Our own come back from TF within this many.
 _REMEMBERED = 1000
-# So many deviations away nobody says the same as we: not we before a restart, nor a recording.
+# A transform that is so many deviations away is not ours: neither from before a restart, nor of a
+# recording.
 _DEVIATIONS = 5.0
 Link = tuple[str, str]  # parent and child
 

@@ -14,9 +14,9 @@ from rclpy.node import Node
 from rs_localizer.ros.node.conversion import message_class, steady_timer
 
 _TYPE, _TOPIC = "bond/msg/Status", "bond"
-# As nav2's own servers have them, in s.
+# Period and timeout (s) of nav2's own servers.
 _PERIOD, _TIMEOUT = 0.1, 4.0
-# As bondcpp's publishers.
+# Queue depth of bondcpp's publishers.
 _DEPTH = 5
 
 

@@ -22,17 +22,17 @@ class State(StrEnum):
 
     INACTIVE = "inactive"
     WAITING = "waiting for"  # what, is the subject
-    # Of the localizer.
+    # States of the localizer.
     BUSY = "busy"
     LOST = "lost"
     LOCALIZED = "localized"
     TRACKING = "tracking"
-    # Of nodes that look at images.
+    # States of nodes that look at images.
     IDLE = "idle"
     DETECTING = "detecting"
 
 
-# What a node that is not active needs, by the label of its state.
+# Advice for a node that is not active, by the label of its state.
 _STEPS = {"unconfigured": "configure and activate it", "finalized": "start it again"}
 
 
@@ -141,7 +141,8 @@ class Diagnostics:
         self._lack = lack
         self._state: tuple[Level, State] | None = None
         self._periods = 0
-        # As diagnostic_updater in C++: with the namespace and without the first slash.
+        # The name is built as by diagnostic_updater in C++, with the namespace and without the
+        # first slash.
         self._name = f"{node.get_fully_qualified_name().lstrip('/')}: {task}"
         self._publisher = node.create_publisher(DiagnosticArray, DIAGNOSTICS, 1)
         self._timer = steady_timer(node, _PERIOD, self._tick)

@@ -69,9 +69,9 @@ class ManagedNode(parameters.Started, LifecycleNode, Generic[Config, Result]):
         self._kind: type[Config] = kind
         self.state = "unconfigured"
         """Label of the state in which the last transition has ended."""
-        # From configuring to cleaning up.
+        # It exists from configuring to cleaning up.
         self.worker: Worker[Result] | None = None
-        # From activating to deactivating.
+        # It exists from activating to deactivating.
         self._inputs: Inputs | None = None
         self._bond: Bond | None = None
         try:
@@ -201,7 +201,8 @@ class ManagedNode(parameters.Started, LifecycleNode, Generic[Config, Result]):
         return self._arrived("inactive", super().on_configure(state))
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        # Before a message can come: publishers that are not active yet drop what they are given.
+        # Publishers must be active before a message can come: inactive ones drop what they are
+        # given.
         result = super().on_activate(state)
         try:
             self.begin(self.config)
@@ -265,11 +266,11 @@ class ManagedNode(parameters.Started, LifecycleNode, Generic[Config, Result]):
 
 # A waiting executor does not see signals: it looks up this often, in s.
 _SIGNAL_LATENCY = 0.1
-# How long the end waits for the frame that is worked on, in s.
+# Longest wait (s) at the end for the frame in progress.
 _LAST_FRAME_TIMEOUT = 0.5
-# How long the end may take in all, in s: 5 after SIGINT a launch file sends SIGTERM, then SIGKILL.
+# Longest end (s) in all: a launch file sends SIGTERM 5 s after SIGINT, then SIGKILL.
 _LONGEST_END = 4.0
-# How long a thread waits for the GIL before it asks for it, in s.
+# Time (s) after which a thread asks for the GIL.
 _SWITCH_INTERVAL = 0.001
 
 
@@ -339,8 +340,8 @@ def _start(node: Any, stop: StopRequest) -> int:
             return 1
         if stop.requested:
             return 0
-    # What has been imported stays; to look through it for garbage takes some tenths of a second,
-    # and must not come between frames.
+    # Imported objects stay. Searching them for garbage takes some tenths of a second and must not
+    # happen between frames.
     gc.collect()
     gc.freeze()
     if node.autostart and node.trigger_activate() != TransitionCallbackReturn.SUCCESS:

@@ -56,9 +56,9 @@ def best(wished: Policies, offers: Sequence[Policies]) -> Policies:
     return reliability, durability
 
 
-# As qos_profile_sensor_data, but reliable where the publishers are, and with more room: what comes
-# while this process does not get the CPU shall be counted by the worker, which keeps the newest,
-# and not be lost unseen.
+# The profile is qos_profile_sensor_data, but reliable if the publishers are, and deeper. Messages
+# that come while this process does not get the CPU must not be lost unseen: the worker keeps the
+# newest one and counts the others.
 SENSOR_DATA = {"depth": 20, "reliability": ReliabilityPolicy.BEST_AVAILABLE}
 # Messages that come some hundred times a second.
 FAST_DATA = SENSOR_DATA | {"depth": 200}
@@ -79,7 +79,7 @@ _OVERRIDABLE = (
 
 # A topic without a message for so long (s) is silent.
 _LONG = 2.0
-# How often the publishers are looked at, in s.
+# Interval (s) at which the publishers are looked at.
 _LOOK_PERIOD = 0.5
 
 

@@ -20,7 +20,7 @@ from rs_localizer.ros.node.conversion import make_message
 if TYPE_CHECKING:  # the detectors need no estimates
     from rs_localizer.io.outputs import Localized
 
-# More points of a map than an eye tells apart only take time.
+# More points of a map only take time: an eye cannot tell them apart.
 _MOST_POINTS = 20_000
 _POINT, _LINE = 0.02, 0.01  # m
 _DEPTH = 0.3  # m, of the drawn view of the camera

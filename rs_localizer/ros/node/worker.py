@@ -25,7 +25,7 @@ they come.
 """
 
 _NAME = "rs_localizer worker"
-# How often frames and results are looked at that wait for something, in s, and how many may.
+# Interval (s) at which waiting frames and results are looked at, and how many may wait.
 _LATE_PERIOD = 0.005
 _MOST_LATE = 100
 
