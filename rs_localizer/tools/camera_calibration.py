@@ -351,7 +351,7 @@ def _values_of(blocks: tuple[Block, ...], name: str) -> Array:
 
 def _interval_share(fitted: Fit, stamps: Stamps) -> float:
     """Return the relative deviation of the interval, if stamps are even and images were not."""
-    # So many images know a variance no better than that.
+    # A variance from so many images is no better known than this.
     chance = 1.0 + 2.0 * math.sqrt(2.0 / len(fitted.state.delays))
     unsaid = fitted.freedom.stamps**2 - chance * stamps.jitter**2
     return _INTERVAL_SHARE * math.sqrt(max(unsaid, 0.0)) / stamps.interval

@@ -23,7 +23,7 @@ from rs_localizer.tools.adjust.spline import spline_through
 from rs_localizer.tools.adjust.variables import Freedom, SplineKeypoints, start_state
 
 _MOST_IMAGES, _LEAST_IMAGES = 30, 4
-# Of the points that the fullest image shows.
+# Least share of the points that the fullest image shows.
 _LEAST_SHARE = 0.6
 # Images with more than so many times the median's error have boards that a hand bends, or mistaken
 # corners: those of public videos have four to seven times it, all others less than twice.
@@ -149,11 +149,11 @@ def _pose(camera: Camera, image: ImagePoints) -> tuple[Array, Array] | None:
         return None
 
     def errors(pose: Array) -> Array:
-        # In pixels, not in rays: far from the middle they are not the same.
+        # The fit is in pixels, not in rays: far from the middle they differ.
         local = image.points @ Rotation.from_rotvec(pose[:3]).as_matrix().T + pose[3:]
         return np.ravel(camera.project(local) - image.pixels)
 
-    # Before several walls the first method may end behind the camera, where no pixel is.
+    # With several walls in view the first method may end behind the camera, where no pixel is.
     for method in (cv2.SOLVEPNP_ITERATIVE, cv2.SOLVEPNP_SQPNP):
         solved, turn, place = cv2.solvePnP(image.points, rays, np.eye(3), None, flags=method)
         with suppress(ValueError):

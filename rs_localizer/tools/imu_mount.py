@@ -38,10 +38,10 @@ _MOST_OFFSET, _MOST_TURN, _MOST_BIAS = 2e-3, np.radians(2.0), np.radians(1.0)
 # Stamps of camera and IMU are looked for within this (s) of each other, in these steps (s): the
 # turns of a hand hardly change within a step.
 _MOST_DELAY, _DELAY_STEP = 0.5, 0.005
-# So many samples are enough for a first guess.
+# A first guess needs no more samples than this.
 _GUESS_SAMPLES = 3000
 _LEAST_GUESS = 100
-# Of the gyroscope's variance, what the camera's turns must explain.
+# Least share of the gyroscope's variance that the camera's rotation must explain.
 _LEAST_EXPLAINED = 0.5
 # A unit is wrong, not a scale, where rates differ by more than this.
 _MOST_SCALE = 1.5

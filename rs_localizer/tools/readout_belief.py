@@ -82,7 +82,7 @@ def disagreement(values: Array, deviations: Array) -> float:
     freedoms = len(values) - 1
     if chdtrc(freedoms, squared) > _DISAGREEMENT:
         return 1.0
-    # What the blocks disagree in is not their noise: none of them is better than the others.
+    # The disagreement of the blocks is not their noise: none of them is better than the others.
     scatter = np.std(values, ddof=1) / math.sqrt(len(values))
     return max(math.sqrt(squared / freedoms), float(scatter) * math.sqrt(total))
 
@@ -108,7 +108,8 @@ _HALVES_SIGMAS = 3.0
 # estimate itself a slow motion, which makes it too long, would make it better known. Nor do slow
 # cameras have slow sensors.
 _DETERMINED_SHARE, _LONGEST_INTERVAL = 0.05, 1.0 / 30.0
-# So many parts have to determine it by themselves, or the recording has to be so long (s).
+# Fewest parts that have to determine it by themselves, or length (s) that the recording has to
+# have.
 _LEAST_TELLING, _LONG = 3, 9.0
 # A global shutter has 0 within so many deviations, and these within this (s): the fastest rolling
 # shutters take 4 ms.
@@ -294,7 +295,7 @@ class ShutterFit:
         return self.axis_chance < CHANCE
 
 
-# So far from what was given is another time: in its own deviations, and s.
+# A time is another one if it differs from the given one by this many deviations, and by this (s).
 _CHECK_DEVIATIONS, _CHECK_LEAST = 6.0, 0.001
 
 

@@ -43,8 +43,8 @@ from rs_localizer.tools.readout_belief import disagreement, discrepancy
 # Turn rates are compared at this interval (s), over at least this time and this part of the shorter
 # recording; so many of the offsets at which they agree best are tried.
 _STEP, _LEAST_SECONDS, _LEAST_SHARE, _TRIED = 0.01, 2.0, 0.3, 10
-# How far the axes of two cameras of one body turn about their mean (rad): half a step of the above
-# at 5 rad/s, and a degree of the splines of cameras whose lens is not known yet.
+# Rotation (rad) of the axes of two cameras of one body about their mean: half a step of the above
+# at 5 rad/s, and a degree for splines of cameras whose lens is not known yet.
 _MOST_TURNED = 0.05
 # Parts of the recording that are estimated on their own.
 _PARTS = 3
@@ -71,8 +71,7 @@ class Mounted:
     # ``offset``: s, to add to its stamps, of first rows, for the time of the first camera's.
     extrinsics: Extrinsics
     deviations: Array  # (7,) of a step of these: rad, m, s
-    # Of the seven above one after the other: what parts of the recording say by themselves makes
-    # them so much larger; 1: nothing.
+    # Factors of the seven deviations above, by the disagreement of parts of the recording; 1: none.
     inflations: Array
 
     @property

@@ -39,8 +39,8 @@ from rs_localizer.tools.adjust.variables import (
     rig_state,
 )
 
-# What is known beforehand: as much as so many numbers of this size (rad/s^2, m/s^2) would tell. A
-# few images that happen to lie on a line say nothing of those that follow.
+# Prior of the accelerations, worth so many numbers of this size (rad/s^2, m/s^2). A few images that
+# happen to lie on a line tell nothing of those that follow.
 _NUMBERS, _USUAL = 6.0, np.array([2.0, 1.0])
 
 
@@ -65,8 +65,8 @@ def squares_and_numbers(fitted: Fit) -> tuple[Array, Array]:
 _MOST_UNCERTAIN = 5.0
 # A sample is bridged where the images with a pose lie farther apart than this many intervals.
 _BRIDGED = 1.5
-# Where images show how accelerations fade, that bridges the knots (s) between them: these need not
-# be as wide as a hand's motion would allow, and narrow ones follow all of it.
+# If images show how accelerations fade, that bridges the knots (s) between them. Knots then need
+# not be as wide as a hand's motion would allow, and narrow ones follow all of it.
 _NARROW_SPACING = 0.025
 # s, in which accelerations fade: hands and drones change them about twice a second.
 _FADING = 0.1
@@ -149,7 +149,7 @@ class Smoothed:
         states = self.fit.state.spline.states(times)
         scale = np.repeat([1.0, self.readout_time], 6)
         empty = np.zeros(0)
-        # At a moment of its own nothing asks for accelerations.
+        # At a moment between images accelerations are not needed.
         joint = np.zeros((len(times), PARAMETERS, PARAMETERS))
         joint[:, :MOTION_PARAMETERS, :MOTION_PARAMETERS] = scale[:, None] * covariances * scale
         return [

@@ -15,7 +15,7 @@ from rs_localizer.core.scanning import REVERSED, ScanDirection
 from rs_localizer.io.imu import ImuRecording
 from rs_localizer.tools.camera_calibration import CameraCalibration
 
-# Beyond this (s rms) the images' own times are worth a word.
+# Beyond this (s rms) the images' own times are mentioned.
 _WORTH_A_WORD = 5e-4
 # A ninth of the image is not covered where no keypoint lies in more than this part of its cells,
 # of which there are so many along each side.
@@ -27,7 +27,7 @@ _REGIONS = (
 
 # A rotation that TF has otherwise by more than this (degrees), and more than chance, is doubted.
 _MOST_TURN, _SIGMAS = 1.0, 4.0
-# Who says how the IMU hangs on the camera.
+# Source of the mount of the IMU on the camera.
 _GIVEN = "TF, or the axes of a video,"
 # Corners that are bent by less (px) are those of a rectified film, or of a telephoto lens.
 _STRAIGHT = 1.5

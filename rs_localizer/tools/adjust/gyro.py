@@ -17,9 +17,9 @@ from rs_localizer.tools.adjust.spline_kernels import CONTROL
 from rs_localizer.tools.adjust.system import Quadratic, Rows
 from rs_localizer.tools.adjust.variables import DELAY, MOUNT, GyroSamples, Unknowns
 
-# What a first guess of turn (rad), bias (rad/s) and delay (s) may be off: as good as nothing, but
-# what the motion does not tell stays where it is. Scales and angles of consumer gyroscopes are good
-# to some percent.
+# Standard deviations of a first guess of rotation (rad), bias (rad/s) and delay (s): nearly no
+# prior, but numbers that the motion does not determine stay in place. Scales and angles of consumer
+# gyroscopes are good to some percent.
 MOUNT_DEVIATIONS = np.repeat([1.0, 1.0, 0.5, 0.03], (3, 3, 1, 6))
 _LIMIT = 6.0  # of Tukey's weight, in standard deviations
 # Samples nearer (s) to the edge of the motion are left out: the delay may yet change.

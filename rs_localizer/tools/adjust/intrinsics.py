@@ -12,12 +12,13 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 
-# What is known of a lens that nobody has calibrated, as standard deviations: focal length by the
-# first guess of it; centre by the image's width (a lens is decentred by less, a crop of the sensor
-# may be by more); focal lengths by each other (pixels are square but for the rounding of scaled
-# videos; before a camera that never rolls, a board that is stretched looks the same); what a
-# coefficient does at the farthest corner by half the diagonal. Distortion is a series that
-# converges: each order does about a third of the one before, a tangential one 0.3 %.
+# Prior of a lens that nobody has calibrated, as standard deviations. The focal length is relative
+# to its first guess. The centre is relative to the image's width: a lens is decentred by less, a
+# crop of the sensor may be by more. The focal lengths are relative to each other: pixels are square
+# up to the rounding of scaled videos, and before a camera that never rolls a stretched board looks
+# the same. Coefficients are by their effect at the farthest corner, in half diagonals. Distortion
+# is a series that converges: each order has about a third of the effect of the one before, a
+# tangential one 0.3 %.
 _FOCAL_LENGTH, _CENTRE, _ASPECT = 0.3, 0.05, 0.002
 _ORDERS, _TANGENTIAL = (0.1, 0.03, 0.01, 0.003), 0.003
 _WIDEST = np.tan(np.radians(70.0))  # corners are not looked at beyond: no pinhole has any there

@@ -23,7 +23,7 @@ from rs_localizer.tools.adjust.spline_kernels import (
 EXTRINSICS = 7
 """Numbers of a camera's mount: turn in its own axes, centre in the body's, offset of its clock."""
 
-# Where the rows overtake the image points to within this share, a keypoint's row says nothing.
+# If the rows overtake the image points to within this share, a keypoint's row determines nothing.
 _LEAST_PACE = 0.1
 
 
@@ -49,7 +49,8 @@ class Projections(NamedTuple):
     by_ray: Array3  # (n,2,2)
     by_lens: Array3  # (n,2,m)
     arms: Array2  # (n,3) from the middle of its body to the landmark, along the map's axes
-    # Where the camera is mounted on what moves along the spline: X_camera = axes (X_body - centre).
+    # Mount of the camera on the body that moves along the spline: X_camera = axes (X_body -
+    # centre).
     axes: Array2  # (3,3)
     centre: Array1  # (3,)
 

@@ -64,7 +64,8 @@ def spline_through(
             all_rotations.append(np.repeat(rotations[part], len(own), axis=0))
             all_positions.append(np.repeat(positions[part], len(own), axis=0))
             continue
-        # Beyond the ends it goes on as it came: a fast one that stops there is an outlier.
+        # Beyond the ends the motion goes on as before: a fast one that stopped there would be an
+        # outlier.
         after = np.clip(np.searchsorted(times[part], own), 1, len(part) - 1)
         first, second = part[after - 1], part[after]
         share = ((own - times[first]) / (times[second] - times[first]))[:, None]

@@ -40,7 +40,7 @@ from rs_localizer.tools.adjust.spline_kernels import CONTROL, LOCAL
 _DENSE = 0.4
 # Rows of a dense matrix from which the blocks are taken at once: 100 MB of 10,000.
 _ROWS_AT_ONCE = 1000
-# Of the eigenvalue of a mode: a hundredth of what it makes of a deviation.
+# Tolerance of a mode's eigenvalue: a hundredth of its effect on a deviation.
 _MODE_TOLERANCE = 0.01
 
 

@@ -156,7 +156,8 @@ class Freedom:
     # The noise is at least this (px). Where images have hardly more keypoints than numbers of their
     # own, a robust estimate rejects all but those it can run through, and ends at no noise at all.
     least_noise: float = 1e-4  # recordings without noise are simulated
-    # Where the camera is on the rig that the motion is of, and its clock; None: that is known.
+    # Prior of the camera's extrinsics on the rig that moves, and of its clock; None: they are
+    # known.
     mounting: MountPrior | None = None
 
 
@@ -183,9 +184,9 @@ class Unknowns:
     landmarks: Array  # (p,3) m
     delays: Array  # (g,) s, how much later than stamped each image was exposed
     mount: GyroMount | None = None  # of the gyroscope, where there is one
-    # Of the camera; the motion is that of what it is mounted to.
+    # Extrinsics of the camera; the motion is that of the body on which it is mounted.
     extrinsics: Extrinsics = field(default_factory=Extrinsics.none)
-    # Of the other cameras of a rig; they move along this spline, whatever theirs are.
+    # Unknowns of the other cameras of a rig, which move along this spline.
     others: tuple[Unknowns, ...] = ()
 
     def with_landmarks(self, landmarks: Array) -> Unknowns:

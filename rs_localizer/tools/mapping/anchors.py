@@ -196,7 +196,7 @@ def _down(rotations: Array) -> Array:
     return axis if axis @ down >= 0.0 else -axis
 
 
-# How well corners are where their map says (m): prints are measured to within this.
+# Standard deviation (m) of corners in their map: prints are measured to within this.
 _DEVIATION = 0.001
 # Observations that determine a corner.
 _LEAST_OBSERVATIONS = 3

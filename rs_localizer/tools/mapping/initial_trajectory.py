@@ -17,8 +17,8 @@ from rs_localizer.tools.adjust.variables import Freedom, Unknowns
 # A stretch reaches so far beyond its images (s), half as long as readouts take; and this share of
 # a known one.
 _MARGIN, _MARGIN_SHARE = 0.025, 0.55
-# Beyond it (rad) nothing says which way a camera turned between two images: a cut of the video, or
-# the end of a line of a survey flight.
+# Beyond this rotation (rad) between two images its direction is unknown: the video is cut, or a
+# line of a survey flight ends.
 _MOST_TURN = 0.5 * math.pi
 # Images in a row of which the motion's own accelerations can be told.
 _LEAST_IMAGES = 10

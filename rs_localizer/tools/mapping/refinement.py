@@ -56,12 +56,12 @@ from rs_localizer.tools.mapping.map_keypoints import (
 )
 from rs_localizer.tools.readout_belief import ReadoutCheck
 
-# Beyond so many unknowns of the motion its matrix takes more than 2 GB.
+# With more unknowns than this the matrix of the motion takes more than 2 GB.
 _MOST_UNKNOWNS = 15000
 # Landmarks are held to where they were by the map's size, which says nothing, but for those that
 # hardly any image sees.
 _LOOSE = 1.0
-# So many landmarks of known place hold the map's frame and size.
+# Landmarks of known place that suffice to hold the frame and size of the map.
 _LEAST_ANCHORS = 3
 # Images in a row that may tell the readout time.
 _LEAST_STRETCH = 20

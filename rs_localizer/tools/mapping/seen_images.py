@@ -38,7 +38,7 @@ _LEAST_PARALLAX = 0.01
 # COLMAP gets all views of a short recording and so many a second of a long one: at a turn of 60
 # degrees a second, neighbours have three quarters of a picture of 60 degrees in common.
 _KEYFRAMES, _KEYFRAMES_PER_SECOND = 60, 4.0
-# After so many, images without features are refused: two seconds of a usual video.
+# After so many images without features the rest is refused: two seconds of a usual video.
 _EARLY_VIEWS = 30
 # Images a hair before their time are in time.
 _EARLY = 0.9

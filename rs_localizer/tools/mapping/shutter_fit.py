@@ -36,9 +36,9 @@ def likely_axes(size: tuple[int, int], given: str | None) -> list[ScanDirection]
     return axes if size[0] >= size[1] else axes[::-1]
 
 
-# How well COLMAP's lens is known: focal length and centre by focal length (of one phone's video 21
-# images give 384.2 px, 42 give 383.2), distortion. Under a steady motion a focal length along the
-# scan stands for a shutter: looser ones leave the two to chance.
+# Standard deviations of COLMAP's lens: focal length and centre over the focal length (of one
+# phone's video 21 images give 384.2 px, 42 give 383.2), and distortion. Under a steady motion a
+# focal length along the scan resembles a shutter; looser priors leave the choice to chance.
 _LENS_DEVIATIONS = 0.005, 0.02
 
 

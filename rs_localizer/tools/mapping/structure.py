@@ -35,9 +35,10 @@ from rs_localizer.tools.mapping.map_keypoints import MapObservations, Start
 
 SPARSE, _TASK = "sparse", "task.json"
 _SCRIPT = Path(__file__).with_name("structure_process.py")
-# So few images are matched each with each (COLMAP's exhaustive matching: 435 pairs take 20 s on
-# two cores); of more, each with so many that follow it, and with those 2^k later (its
-# sequential matching), and every n-th with every n-th, so many of them: there loops close.
+# Up to so many images, each is matched with each (COLMAP's exhaustive matching: 435 pairs take 20 s
+# on two cores). Of more images, each is matched with so many that follow it and with those 2^k
+# later (its sequential matching), and every n-th with every n-th, so many of them: loops close
+# there.
 _EXHAUSTIVE, _OVERLAP = 30, 10
 # COLMAP has the corner of the first pixel at 0, 0; here that is its centre.
 HALF = 0.5
@@ -64,8 +65,8 @@ class Effort:
 
     threads: int = 1  # of COLMAP's mapping; with more than one, the last digits vary
     seed: int = 0
-    # Of an image. COLMAP's own 8192 take sixteen times as long to match as 2048, all in all 213 s
-    # of CPU on half of 103 images of 800x600.
+    # Features of an image. COLMAP's default of 8192 takes sixteen times as long to match as 2048:
+    # 213 s of CPU in all on half of 103 images of 800x600.
     features: int = 2000
     # Keypoints of a view that are adjusted: more say little more, and cost time.
     adjusted: int = 150
@@ -170,7 +171,7 @@ def pairs_of(count: int) -> list[tuple[int, int]]:
 def _run(task: Path, stage: Stage) -> dict[str, Any]:
     """Return the task's result; name a process that dies with the last that it said."""
     command = [sys.executable, str(_SCRIPT), str(task)]
-    # Else a script imports from its own folder first.
+    # Without it a script would import from its own folder first.
     environment = os.environ | {"PYTHONSAFEPATH": "1"}
     result: dict[str, Any] = {}
     with TemporaryFile("w+", encoding="utf-8", errors="replace") as log, subprocess.Popen(

@@ -108,7 +108,7 @@ def _map(task: dict[str, Any], database: Path, folder: Path) -> list[Any]:
         options.mapper.abs_pose_refine_focal_length = False
         options.mapper.abs_pose_refine_extra_params = False
     _say("stage", "map", len(task["names"]))
-    # What COLMAP writes on its own, a folder for each part, is not kept.
+    # COLMAP's own output, a folder for each part, is not kept.
     with TemporaryDirectory(dir=folder) as parts:
         models = pycolmap.incremental_mapping(
             database, task["images"], parts, options, next_image_callback=lambda: _say("step", 1)

@@ -57,7 +57,8 @@ from rs_localizer.tools.readout_belief import ReadoutCheck, disagreement
 
 # Steps of Gauss and Newton, and the noise of each by what it is.
 _NOISES = (10.0,) * 6 + (1.0,) * 4
-# Of the cost of independent errors: the other pose is e^6 times less likely, or it may be true.
+# Least difference of the costs of independent errors: the other pose is e^6 times less likely, or
+# it may be true.
 _LEAST_DIFFERENCE = 12.0
 
 
@@ -130,7 +131,7 @@ def _mirrored(given: Adjustable, fitted: Fit) -> tuple[BoolArray, BoolArray, Unk
     own, theirs = (_costs(problem, state, fitted.deviation) for state in (fitted.state, other))
     better = theirs < own
     doubtful = np.abs(theirs - own) < _LEAST_DIFFERENCE * fitted.inflation
-    # What came back is the same pose.
+    # A pose that came back is the same one.
     apart = _normals(other) * _normals(fitted.state)
     same = np.sum(apart, axis=1) > np.cos(0.02)
     chosen = np.where(
@@ -281,7 +282,7 @@ def survey(
         raise ValueError(f"the images do not determine the markers' poses: {error}") from error
     if isinstance(done, Survey):
         return done
-    # What they say of the motion is wrong, too.
+    # Their contribution to the motion is wrong, too.
     lost = tuple(markers[m] for m in done)
     if origin in done or len(chained.markers) - len(lost) < 2:
         names = ", ".join(marker.name for marker in lost)
@@ -440,7 +441,7 @@ def _grown(given: Adjustable, start: Unknowns, freedom: Freedom, grown: Array) -
     shown = np.concatenate([each.points for each in given.seen]) // 4
     share = np.bincount(shown, fitted.inliers, len(grown)) / np.bincount(shown)
     grown = np.where(share < _LEAST_FIT, 0.0, grown)  # no size explains those
-    # By the costs, too: weights of Tukey's estimator hide what speaks against a size.
+    # The costs are compared, too: weights of Tukey's estimator hide evidence against a size.
     for k in np.argsort(np.abs(grown))[np.count_nonzero(grown == 0.0) :].tolist():
         less = np.where(np.arange(len(grown)) == k, 0.0, grown)
         plain = given.fit(_resized(fitted.state, less - grown), freedom, fitted.deviation, True)

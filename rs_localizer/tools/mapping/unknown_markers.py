@@ -89,15 +89,15 @@ def _whole_markers(detections: Detections, end: int) -> dict[int, IntArray]:
     return {m: np.array(rows) for m, rows in corners.items() if min(rows) >= 0}
 
 
-# Of a pair, evenly, so many images are compared.
+# Images of a pair that are compared, evenly chosen.
 _MOST_IMAGES = 40
-# How far what two images say may differ: in sides, and rad.
+# Largest difference of the estimates of two images: in sides, and rad.
 _SAME_PLACE, _SAME_TURN = 0.3, 0.15
 # Poses of an image whose errors are within this factor of the least may be true.
 _ALIKE = 3.0
 # Errors of a corner beyond this (of the focal length) all count the same.
 _GROSS = 0.02
-# What a rolling shutter leaves of a square's pose (px).
+# Effect of a rolling shutter on a square's pose (px).
 _SHUTTER = 0.5
 # Until then (s) an image is near the one before.
 _NEAR = 0.25
@@ -176,7 +176,7 @@ def chain(
     return Chained(markers, placed, own_frames, poses, apart)
 
 
-# Of a pair of markers, so many images say how their sizes compare, if what they say agrees.
+# Fewest images that compare the sizes of a pair of markers, and how well they must agree.
 _LEAST_SEEN, _AGREE = 6, 0.9
 _SIZE_ROUNDS = 10
 # Sizes that are wrong by more than this share: a first guess needs others.
@@ -299,11 +299,11 @@ def _agreed(said: list[tuple[int, Transform, float]], size: float) -> tuple[Tran
     fits = np.array([fit for _, _, fit in said])
     cosines = 0.5 * (np.einsum("nij,mij->nm", turns, turns) - 1.0)
     angles = np.arccos(np.clip(cosines, -1.0, 1.0))
-    # What is far from both is known less well.
+    # Places that are far from both are known less well.
     reach = _SAME_PLACE * size + 0.1 * np.linalg.norm(places, axis=1)
     apart = np.linalg.norm(places[:, None] - places, axis=2) / reach[:, None]
     agree = np.exp(-((angles / _SAME_TURN) ** 2) - apart**2) * fits
-    # Of each image only what agrees best counts.
+    # Of each image only the candidate that agrees best counts.
     firsts = np.flatnonzero(np.diff(image, prepend=-1))
     per_image = np.maximum.reduceat(agree, firsts, axis=1)
     support = per_image.sum(axis=1)

@@ -59,7 +59,7 @@ def _reductions(texture: Image) -> list[Image]:
     return images
 
 
-# Where in a pixel its two by two rays go through, along either axis.
+# Places in a pixel of its two by two rays, along either axis.
 _WITHIN = np.array([-0.25, 0.25])
 # An exposure is cut into instants between which no point moves by more than this (px) ...
 _LONGEST_STEP = 1.0

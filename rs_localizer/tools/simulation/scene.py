@@ -16,7 +16,7 @@ _BOXES = 120
 _BOX_SIZE = (0.1, 0.8)
 # Unevenness of the walls (m): pictures, shelves, pipes.
 _RELIEF = 0.1
-# Nothing stands closer than this to the path of the camera (m).
+# Least distance (m) of anything from the path of the camera.
 _CLEARANCE = 0.8
 
 

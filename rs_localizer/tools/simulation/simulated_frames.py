@@ -25,7 +25,7 @@ _NEAREST = 0.3
 _BORDER_SIGMAS = 4.0
 # A lens model may fold far points back into the image; these bearings do not return (rad).
 _FOLD_TOLERANCE = 1e-3
-# How far a middle-row view may differ from the rolling one, in image sizes.
+# Largest difference between a middle-row view and the rolling one, in image sizes.
 _VIEW_MARGIN = 0.15
 # Row times beyond this are of no interest (the image ends at 0.5).
 _FARTHEST_ROW = 2.0

@@ -22,7 +22,7 @@ from rs_localizer.tools.simulation.simulated_recording import write_truths
 
 # Share of the bits that differ between two views of a landmark; ORB's median is about this.
 BIT_ERRORS = 0.1
-# Of each number of a descriptor whose numbers have the deviation 1.
+# Noise of each number of a descriptor whose numbers have the deviation 1.
 DEVIATION = 0.3
 
 

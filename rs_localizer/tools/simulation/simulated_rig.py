@@ -30,7 +30,7 @@ from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, frame
 from rs_localizer.tools.simulation.simulated_recording import write_truth
 from rs_localizer.tools.simulation.true_motion import TrueMotion, TrueState
 
-# How far the rates of cameras' oscillators are off, as a part of themselves: common quartz.
+# Relative error of the rates of cameras' oscillators: common quartz.
 _RATE_ERROR = 5e-5
 # The random numbers of clocks are their own.
 _CLOCK_STREAM = 28

@@ -129,12 +129,12 @@ _FAMILY = "4x4_250"  # few cells: the largest that a far or slanted marker can s
 _CELL_TEXELS = 24
 # Sides of the markers (m) on the walls and, seen at a slant, on the floor; gaps in sides.
 _WALL_MARKER, _FLOOR_MARKER, _GAP = 0.42, 0.56, 0.5
-# From the path of the camera (m) to the two walls, to where they end, to the floor and to the top:
-# a larger room would be all markers too small to read, a smaller one would show too few.
+# Distances (m) from the path of the camera to the two walls, to their ends, to the floor and to the
+# top. In a larger room all markers would be too small to read; a smaller one would show too few.
 _NEAR, _OPEN, _BELOW, _ABOVE = 1.5, 3.1, 0.9, 1.8
 # Each plane has its own light, so that edges can be seen: grey of its paper and its ink.
 _LIGHTS = ((235, 26), (200, 22), (172, 18))
-# Of pictures that are no markers (m).
+# Texel (m) of pictures that are no markers.
 _PICTURE_TEXEL = 0.003
 
 
@@ -260,7 +260,7 @@ def _picture(
 
 # Texels along a cell of a marker: corners lie between texels, so that nothing is rounded.
 _POSTER_TEXELS = 14
-# Where along a wall its markers hang, in shares of its width.
+# Places of the markers along a wall, in shares of its width.
 _PLACES = (0.3, 0.7)
 PAPER_AND_INK = (235, 26)
 
@@ -295,7 +295,7 @@ def _hang(texture: Image, plane: TexturedPlane, share: float, number: int, viewe
     sheet = side + 2 * _POSTER_TEXELS
     white = np.pad(pattern(drawn, number), 1, constant_values=True)
     paper = printed(white, PAPER_AND_INK, _POSTER_TEXELS)
-    # From inside the room, half of the walls are read from behind.
+    # Seen from inside the room, half of the walls are mirrored.
     mirrored = float(plane.normal @ (viewer - plane.corner)) > 0.0
     height, width = texture.shape
     upright = abs(plane.down[2]) > 0.5
