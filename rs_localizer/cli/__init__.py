@@ -46,7 +46,7 @@ def earlier_result(
     out: Path = place or args.out
     resume_results([out])
     if resume(out):
-        raise ValueError(f"another command is writing into {out}; wait for its end")
+        raise ValueError(f"another command is writing to {out}; wait until it ends")
     there = content(out)
     if not out.exists() or (out.is_dir() and not there):
         return ()

@@ -50,7 +50,7 @@ class Options(ResultOptions):
     first_id: int = option("id of the first marker", "N", 0, limits=(0, math.inf))
     page: str = option("of paper", default="a4", choices=sorted(PAGES))
     standing: bool = option(
-        "map frame with z up and y into the wall; otherwise x is to the right, y up and z toward "
+        "map frame with z up and y into the wall; otherwise x is to the right, y up and z towards "
         "the viewer, which is right for a print that lies on a table", default=False,
     )  # fmt: skip
 

@@ -3,7 +3,7 @@
 """Files of marker maps: our own YAML (an example is in docs/maps.md) and those of other programs.
 
 Which it is, what a file holds tells. Poses are of the print's frame: origin in its middle, x to the
-right, y up, z toward the viewer; corners go from the top left one clockwise, from the front.
+right, y up, z towards the viewer; corners go from the top left one clockwise, from the front.
 
 * Bundles of apriltag_ros (ROS 1), YAML: m; axes of a tag are those of a print
   (AprilRobotics/apriltag_ros #156); what is missing of a pose is that of the origin.
@@ -183,15 +183,14 @@ def _bundle(file: _Entry, name: str) -> Iterator[Marker]:
 _EXPLANATION = """\
 # Where prints are, in the frame map_frame; all lengths in metres.
 #   size: side of the black square of a marker, without the white rim around it
-#   square: of a board: side of its squares
-#   position: of the middle of the print, x y z in map_frame
+#   square: side of the squares of a board
+#   position: middle of the print, x y z in map_frame
 #   quaternion: x y z w (not w x y z), of length 1; turns the print's axes into those of the map.
-#     Axes of a print: x to the right, y up, z out of the paper toward who looks at it.
+#     Axes of a print: x to the right, y up, z out of the paper towards the viewer.
 #     [0, 0, 0, 1]: the same axes as the map. [0.7071, 0, 0, 0.7071]: upright in a map whose z is up
 #     and whose y points into the wall.
-#   shape: of a board: how far from flat each of its points is, x y z along its axes, as calibrate
-#     finds it
-#   deviation: of a board: how well its points are known, m; not given: as those of paper
+#   shape: offset of each point of a board from flat, x y z along its axes, by calibrate
+#   deviation: standard deviation of the points of a board, m; not given: that of paper
 #   corners: instead of these three: top left, top right, bottom right, bottom left, from the front
 #   position_deviation, rotation_deviation: standard deviations of a survey along the axes of
 #     map_frame, m and rad

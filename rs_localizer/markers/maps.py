@@ -119,7 +119,7 @@ def wall(
         size: side of a marker, m.
         gap: between the sides of neighbours, m.
         first_id: id of the top left marker.
-        pose: of the middle of the wall: x to the right, y up, z toward the viewer.
+        pose: of the middle of the wall: x to the right, y up, z towards the viewer.
     """
     pose = pose or Pose()
     columns, rows = grid

@@ -232,7 +232,7 @@ def do_all(
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise ValueError(f"another command is writing into {out}; wait for its end") from None
+            raise ValueError(f"another command is writing to {out}; wait until it ends") from None
         outcomes = dict[Path, Outcome]()
         waiting = [task for task in tasks if finished(task) is None]
         try:

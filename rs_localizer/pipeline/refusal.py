@@ -93,7 +93,9 @@ REASONS: dict[str, Meaning] = {
         "orientation deviation above max_orientation_deviation",
         "come nearer, show more of the map",
     ),
-    Reason.SCAN_AXIS: Meaning("scan_direction names the wrong axis", "set that of the message"),
+    Reason.SCAN_AXIS: Meaning(
+        "scan_direction names the wrong axis", "set the one that the message names"
+    ),
     Reason.AWAITS_FRAMES: Meaning("output_lag waits for later frames", "nothing is wrong"),
     Reason.NO_CAMERA_INFO: Meaning(
         "no usable camera_info yet", "is it recorded, is its topic right?"
@@ -120,7 +122,7 @@ REASONS: dict[str, Meaning] = {
         "no keypoint or tag matches the map", "are descriptors, or ids, of one kind?"
     ),
     Reason.BAD_IMAGE: Meaning(
-        "the image cannot be read", "encodings: mono, color, Bayer, YUV, JPEG, PNG"
+        "the image cannot be read", "encodings: mono, colour, Bayer, YUV, JPEG, PNG"
     ),
     Reason.INTERNAL_ERROR: Meaning("a fault of this program", "please report the message"),
     Reason.NO_STAMP: Meaning(

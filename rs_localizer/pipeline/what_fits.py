@@ -146,8 +146,8 @@ def cameras_apart(
     if len(own) < 2:
         return ""
     return (
-        f"{' and '.join(own)} have poses of their own, which do not agree: extrinsics or clocks "
-        "are others (rs_localizer calibrate --rig)"
+        f"{' and '.join(own)} have poses of their own that disagree: extrinsics or clocks "
+        "are wrong (rs_localizer calibrate --rig)"
     )
 
 

@@ -235,7 +235,7 @@ class Evidence:
             )
         slowest = abs(self.readout_time) + _GLOBAL_SIGMAS * self.deviation
         if not (self.near_zero or self.own_stamps) and slowest < _GLOBAL:
-            return "; no rolling shutter is that fast: was the video stabilised or processed?"
+            return "; no rolling shutter is that fast: was the video stabilized or processed?"
         if self.near_zero and not self.global_shutter:
             reason = (
                 "three deviations are more than 2 ms" if self.inflation == 1.0 and self.own_stamps

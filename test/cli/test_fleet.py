@@ -94,7 +94,7 @@ def test_results_of_other_settings_are_in_the_way(recordings, tmp_path, monkeypa
     with (out / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         assert main([*words, "--overwrite"]) == 1
-    assert f"another command is writing into {out}; wait" in capsys.readouterr().err
+    assert f"another command is writing to {out}; wait" in capsys.readouterr().err
 
 
 def test_what_goes_wrong_is_one_line(recordings, tmp_path, monkeypatch, capsys):

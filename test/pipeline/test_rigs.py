@@ -93,5 +93,5 @@ def test_a_wrong_extrinsic_is_named(tmp_path):
     frames, refused, notices = localize(tmp_path / "bag")
     assert len(frames) < 0.2 * len(refused)
     (said,) = {text for name, text in notices if name == "extrinsics"}
-    assert said.startswith("left and right have poses of their own, which do not agree")
+    assert said.startswith("left and right have poses of their own that disagree")
     assert said in refused[-1].detail

@@ -69,7 +69,7 @@ def advice(built: Built, views: Sequence[SeenImage]) -> list[str]:
     known = shutter.visible and shutter.axis_known if shutter else not built.refined.apart
     if not known:
         said.append(
-            "for the readout time, film at the camera's own rate (no time lapse, no stabilisation) "
+            "for the readout time, film at the camera's own rate (no time lapse, no stabilization) "
             "and rotate the camera quickly, sideways and up and down, for some seconds"
         )
     return said
