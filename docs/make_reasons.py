@@ -17,7 +17,7 @@ from rs_localizer.pipeline.refusal import IMU_REASONS, REASONS, SETTINGS, Meanin
 
 REASONS_PAGE = Path(__file__).with_name("reasons.md")
 _REASONS_INTRODUCTION = """\
-# Reasons, notices and states: what it says, and what to do
+# Reasons, notices and states, and what to do
 
 ## Why a frame has no pose
 

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""R6P: all solutions of the double-linearised rolling-shutter model for six points.
+"""R6P: all solutions of the double-linearized rolling-shutter model for six points.
 
     lambda x = (I + r [w]x) (I + [v]x) X + C + r t
 
