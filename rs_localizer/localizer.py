@@ -58,7 +58,7 @@ from rs_localizer.solvers.table import find_solver, start_solver
 
 # A prediction may be wrong by this multiple of the inlier threshold.
 _PREDICTION_SCALE = 16.0
-# With one standard deviation in each direction, 95 % of the points lie within so many of them
+# With one standard deviation in each direction, 95 % of the points lie within this many of them
 # (Rayleigh's distribution).
 _MAP_GATE = 2.45
 # rad/s, twice the range of most gyroscopes (2000 deg/s).

@@ -231,7 +231,7 @@ class ShutterWatch:
         return _Look(time_ns, found, units, rows, off, squeeze)
 
     def _measure(self, before: _Look, now: _Look, after: _Look, seconds: float) -> None:
-        """Take what a frame shows whose neighbours are so many s apart."""
+        """Take what a frame shows whose neighbours are this many s apart."""
         assert self._camera is not None
         back = now.found.rotation
         turn = so3.log(np.ascontiguousarray(before.found.rotation @ back.T))

@@ -77,7 +77,7 @@ if TYPE_CHECKING:  # without a gyroscope nobody needs them
 
 # After a longer gap (s) a prediction helps less than a fresh search.
 _LONGEST_GAP = 1.0
-# If so many frames in a row are closer than a microsecond, times are seconds or milliseconds.
+# If this many frames in a row are closer than a microsecond, times are seconds or milliseconds.
 _LEAST_STEP_NS, _MOST_TOO_CLOSE = 1000, 3
 # No video has a nanosecond count below this; these are seconds and milliseconds of the years 2001
 # to 2096.

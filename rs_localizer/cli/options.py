@@ -112,7 +112,7 @@ class FleetOptions:
     """many recordings."""
 
     workers: int | None = option(
-        "so many at a time, each in a process of its own (pip install 'rs_localizer[fleet]')",
+        "recordings at a time, each in a process of its own (pip install 'rs_localizer[fleet]')",
         "N",
         limits=(1, math.inf),
     )
@@ -166,7 +166,7 @@ def _add(group: argparse._ActionsContainer, kind: type[Any], item: Any) -> None:
     about, name = item.metadata, item.name
     one, many = _element(typing.get_type_hints(kind)[name])
     repeated = many is list and not about["metavar"].endswith("...")
-    if typing.get_origin(one) is tuple:  # each time so many
+    if typing.get_origin(one) is tuple:  # each time this many
         one, many = _element(one)
     words: dict[str, Any] = {"help": about["help"].replace("%", "%%")}
     if one is bool:

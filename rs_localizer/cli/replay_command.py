@@ -72,7 +72,7 @@ class Options(ImageOptions, FleetOptions):
         default=False,
     )
     pose_rate: float | None = option(
-        "with --smooth: poses of the motion so many times a second (default: one for each image)",
+        "with --smooth: poses of the motion per second (default: one for each image)",
         "HZ", limits=(0.0, math.inf), above=True,
     )  # fmt: skip
     parquet: Path | None = option(

@@ -139,7 +139,7 @@ class CameraOptions:
 class Options(MotionOptions, CameraOptions, ResultOptions):
     out: Path = argument("bag directory to create", "OUT")
     points: int = option(
-        "of a frame, if it sees so many", "N", _POINTS.points, limits=(1, math.inf)
+        "points of a frame, if it sees that many", "N", _POINTS.points, limits=(1, math.inf)
     )
     noise: float | None = option(
         f"deviation: px of each raw coordinate (default: {_POINTS.noise:g}); of images, grey "

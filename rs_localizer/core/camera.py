@@ -112,7 +112,7 @@ def _check_exchanged(K: Array, width: int, height: int) -> None:
         )
 
 
-# A focal length of so many widths sees 6 degrees; in pixels nothing is as short.
+# A focal length of this many widths sees 6 degrees; in pixels nothing is as short.
 _LONGEST_IN_WIDTHS = 10.0
 
 

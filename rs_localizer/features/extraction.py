@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rs_localizer.config import FeatureKind
 from rs_localizer.core.arrays import Array, IntArray
 
-# A corner is looked for within so many pixels of FAST's, gradients are summed over as many.
+# A corner is looked for within this many pixels of FAST's, gradients are summed over as many.
 _REACH = _WINDOW = 1
 # Around a corner: its reach, a neighbour for the parabola, the window, a neighbour for gradients.
 _MARGIN = _REACH + 1 + _WINDOW + 1

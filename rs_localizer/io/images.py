@@ -90,7 +90,7 @@ class Image:
 
 
 def most_pixels(packed: int) -> int:
-    """Return the most pixels that an image of so many packed bytes may have."""
+    """Return the most pixels that an image of this many packed bytes may have."""
     return min(_ALIKE + _DENSEST * packed, MOST_PIXELS)
 
 
@@ -185,7 +185,7 @@ def decode(packed: bytes, format_: str) -> Gray:
 
 
 def check_size(size: tuple[int, int], count: int, what: str) -> None:
-    """Refuse an image (``what``) of more pixels than so many bytes can hold, or any camera has."""
+    """Refuse an image (``what``) of more pixels than its bytes can hold, or any camera has."""
     if math.prod(size) > most_pixels(count):
         raise MessageError(
             f"{what} says that it is {size[0]} x {size[1]}, too much for {count} bytes, or more "

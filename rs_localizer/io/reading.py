@@ -29,7 +29,7 @@ LENS = "lens"
 _MOST_VALUES, _MOST_JSON, _DEEPEST = 100_000, 1_000_000, 50
 # libyaml reads 5 MB a second, PyYAML alone a tenth of that.
 _MOST_CHARACTERS = 2_000_000
-# Characters of a file, of which JSON alone uses so many; /dev/zero and some pipes never end.
+# Characters of a file, of which JSON alone uses this many; /dev/zero and some pipes never end.
 _LONGEST = 20_000_000
 # Longest text of a number; numbers of base 60 ("1:0:0 ...", YAML 1.1) take time that grows with its
 # square.
@@ -151,7 +151,7 @@ _MEASURED, _LARGE = 8, 2**27
 
 
 def most_unpacked(packed: int) -> int:
-    """Return the most bytes that so many packed bytes of a message or a text may become."""
+    """Return the most bytes that this many packed bytes of a message or a text may become."""
     return min(BEST_PACKED * packed + _ALIKE, max(_LARGE, _MEASURED * packed))
 
 

@@ -118,7 +118,7 @@ class Video:
             return []
 
     def _by_opencv(self) -> Iterator[VideoImage]:
-        # It gives up after so many packets of other streams in a row.
+        # It gives up after this many packets of other streams in a row.
         os.environ.setdefault("OPENCV_FFMPEG_READ_ATTEMPTS", str(2**31 - 1))
         most = most_pixels(self.path.stat().st_size)
         os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = f"max_pixels;{most}"
@@ -167,7 +167,7 @@ def _container(path: Path, most: int) -> Iterator[Any]:
 
 
 def _stream(container: Any, most: int) -> Any:
-    """Return the first stream of images that has a decoder and at most so many pixels."""
+    """Return the first stream of images that has a decoder and at most this many pixels."""
     streams = [stream for stream in container.streams.video if stream.codec_context is not None]
     for stream in streams:
         if 0 < stream.width * stream.height <= most:

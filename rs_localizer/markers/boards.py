@@ -32,7 +32,7 @@ _LARGEST_SEARCH = 1024
 # OpenCV's search fails in smaller ones (px), which cannot show a board.
 _SMALLEST_SEARCH = 16
 _REFINE_CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
-# The size of a chessboard is looked at in one of so many images, until so many have shown it.
+# The size of a chessboard is looked at in one of this many images, until this many have shown it.
 _EVERY, _SIZES = 10, 9
 
 

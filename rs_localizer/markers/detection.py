@@ -23,7 +23,7 @@ IntArray = NDArray[np.int64]
 # After this long without a board (ns) it may lie the other way round.
 _LONGEST_LOSS_NS = 1_000_000_000
 # Other markers of a family larger than this are looked for in the first images, and then in one of
-# so many: they are only told of, and a large family takes several times as long.
+# this many: they are only told of, and a large family takes several times as long.
 _LARGE, _FIRST_IMAGES, _ONE_IN = 100, 5, 30
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rs_localizer.core.arrays import Array, Array3, ByteArray2, Out
 from rs_localizer.native import entry, inlined, kernel
 
-# px between the samples of a profile; more for one that reaches farther than so many steps.
+# px between the samples of a profile; more for one that reaches farther than this many steps.
 _STEP, _MOST_STEPS = 0.5, 7
 _LEAST_RISE = 10.0  # gray levels from black to white
 SEEN, VARIANCE, BLACK, WHITE, CUT = range(5)
@@ -157,9 +157,9 @@ _AROUND = 0.3
 # in px across that side, beside half of what motion smears it; never more than so much.
 _END_SHARE, _END_PIXELS, _MOST_END_SHARE, _LEAST_SINE = 0.1, 2.0, 0.3, 0.1
 _LEAST_POINTS = 4
-# A shorter side of so many points is a parabola where that leaves less, by so many variances. Of a
-# fisheye (f = 260 px, sides of 35 px, noise of 3 gray levels) straight lines lay corners 0.150 px
-# too far outside; with 8 and 20 variances 0.003 and 0.009. Points share pixels, so that straight
+# A shorter side of this many points is a parabola where that leaves less, by this many variances.
+# Of a fisheye (f = 260 px, sides of 35 px, noise of 3 gray levels) straight lines lay corners 0.150
+# px too far outside; with 8 and 20 variances 0.003 and 0.009. Points share pixels, so that straight
 # sides (18 to 38 px) may look bent: errors of 0.042, 0.030, 0.0241 px with 2, 8, 20, of lines alone
 # 0.0236.
 _PARABOLA_FROM, _LEAST_TO_BEND, _WORTH = 40.0, 8, 20.0  # px, points, noise variances

@@ -51,7 +51,7 @@ COLUMNS = {
     "camera": "string",
     **dict.fromkeys(("first_row", "middle_row", "last_row"), "list 7"),
 }
-"""Names and types; list: so many doubles (docs/recordings.md says more)."""
+"""Names and types; list: this many doubles (docs/recordings.md says more)."""
 
 _ROWS = 1000  # that are Python's objects before they become Arrow's
 

@@ -230,7 +230,7 @@ class FrameLocalizer(ABC):
         self._apply_settings(self._config)
 
     def awaits_imu(self, stamp_ns: int, patience: float) -> bool:
-        """Return True if readings of the frame with this stamp may come within so many seconds."""
+        """Return True if readings of this frame may come within this many seconds."""
         return False
 
     def load_files(self) -> None:

@@ -17,8 +17,8 @@ from rs_localizer.pipeline.refusal import Notify, Refusal
 # Frames that come in another order than they were taken are late by less (s); a recording that
 # starts over goes back by more.
 _LATE = 0.5
-# A camera that is so many times faster than configured, over so many s, measures in other units:
-# of a map in millimetres poses are a thousand times too far apart, and as much less certain.
+# A camera that is this many times faster than configured, over this many s, measures in other
+# units: of a map in millimetres poses are a thousand times too far apart, and as much less certain.
 _TOO_FAST, _WINDOW = 20.0, 2.0
 _LONGEST_STEP = 0.5  # s
 # s from pose to pose, of which the speed is measured: noise of some 10 mm is 0.05 m/s.

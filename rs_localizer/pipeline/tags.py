@@ -17,8 +17,8 @@ from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse
 
-# The order of corners is held against the map until so many images of two or more tags agree, then
-# in one image of so many.
+# The order of corners is held against the map until this many images of two or more tags agree,
+# then in one image of this many.
 _AGREED, _ONE_IN = 20, 30
 # Other orders in which our four corners may be given.
 _ORDERS = [

@@ -26,8 +26,8 @@ REASONS = frozenset({
 
 # Least share of inliers: a fault that all points share leaves only the outliers of any frame.
 _MOST = 0.7
-# Single frames are refused for many reasons: one in ever so many times more is tried, so that a day
-# of refusals costs some ten tries.
+# Single frames are refused for many reasons: one in a growing number of times more is tried, so
+# that a day of refusals costs some ten tries.
 _RARER = 4
 # Frames that say the same: one may fit by chance.
 _AGREED = 2

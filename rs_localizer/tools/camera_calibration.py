@@ -112,7 +112,7 @@ _FIRST_JITTERS = (0.1, 0.3)
 # Less than this does no harm, and may be a motion that the knots do not follow.
 _LEAST_JITTER = 0.03
 _LEAST_STAMPS = 1e-5  # s
-# The prior of the accelerations is so many times their median, and at least this.
+# The prior of the accelerations is this many times their median, and at least this.
 _ACCELERATIONS, _LEAST_ACCELERATION = 1.5, 0.3
 
 
@@ -351,7 +351,7 @@ def _values_of(blocks: tuple[Block, ...], name: str) -> Array:
 
 def _interval_share(fitted: Fit, stamps: Stamps) -> float:
     """Return the relative deviation of the interval, if stamps are even and images were not."""
-    # A variance from so many images is no better known than this.
+    # A variance from this many images is no better known than this.
     chance = 1.0 + 2.0 * math.sqrt(2.0 / len(fitted.state.delays))
     unsaid = fitted.freedom.stamps**2 - chance * stamps.jitter**2
     return _INTERVAL_SHARE * math.sqrt(max(unsaid, 0.0)) / stamps.interval

@@ -25,8 +25,8 @@ from rs_localizer.tools.adjust.variables import Freedom, SplineKeypoints, start_
 _MOST_IMAGES, _LEAST_IMAGES = 30, 4
 # Least share of the points that the fullest image shows.
 _LEAST_SHARE = 0.6
-# Images with more than so many times the median's error have boards that a hand bends, or mistaken
-# corners: those of public videos have four to seven times it, all others less than twice.
+# Images with more than this many times the median's error have boards that a hand bends, or
+# mistaken corners: those of public videos have four to seven times it, all others less than twice.
 _ODD = 3.0
 # Focal lengths by image width to begin with, before scenes that are no plane.
 _FOCAL_LENGTHS = (0.35, 0.7, 1.0, 1.4)

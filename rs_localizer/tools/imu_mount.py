@@ -28,7 +28,7 @@ from rs_localizer.tools.adjust.variables import (
 _ROUNDS, _SETTLED = 6, 0.03
 _LEAST_DEVIATION = 1e-6  # rad/s; recordings without noise are simulated
 # A gyroscope sees what images do not: knots may be so much finer than theirs, but no finer than
-# so many samples.
+# this many samples.
 _MOST_HALVINGS, _LEAST_SAMPLES = 3, 2.0
 _COST_PER_PARAMETER = 2.0  # Akaike, as of the knots of the images alone
 # Determined is what is known to this (s, rad, rad/s).

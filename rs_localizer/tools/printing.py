@@ -39,7 +39,7 @@ class Page:
 
 
 def largest_side(page: str, across: float, down: float) -> float:
-    """Return the side (m, whole 5 mm) of the largest squares of which so many fit on a page.
+    """Return the side (m, whole 5 mm) of the largest squares of which this many fit on a page.
 
     Args:
         page: one of :data:`PAGES`, upright or on its side.
@@ -151,7 +151,7 @@ def _rectangles(white: NDArray[np.bool_], cell: float) -> Array:
 
 
 def page_files(path: Path, count: int) -> list[Path]:
-    """Return the files of so many pages: one PDF, or a PNG for each.
+    """Return the files of this many pages: one PDF, or a PNG for each.
 
     Raises:
         PrintError: for another ending.

@@ -111,7 +111,7 @@ _DETERMINED_SHARE, _LONGEST_INTERVAL = 0.05, 1.0 / 30.0
 # Fewest parts that have to determine it by themselves, or length (s) that the recording has to
 # have.
 _LEAST_TELLING, _LONG = 3, 9.0
-# A global shutter has 0 within so many deviations, and these within this (s): the fastest rolling
+# A global shutter has 0 within this many deviations, and these within this (s): the fastest rolling
 # shutters take 4 ms.
 _GLOBAL_SIGMAS, _GLOBAL = 3.0, 2e-3
 # Images that were exposed so far (s rms) beside their stamps have stamps that no camera gave.
@@ -255,9 +255,9 @@ def apart_of(halves: tuple[Block, ...]) -> tuple[float, float]:
     return abs(one.readout_time - other.readout_time), noise
 
 
-# A readout time is believed beyond so many deviations: two axes with two directions each are tried,
-# four chances together one in 8,000, and deviations, which few seconds tell, may be too small by a
-# third.
+# A readout time is believed beyond this many deviations: two axes with two directions each are
+# tried, four chances together one in 8,000, and deviations, which few seconds tell, may be too
+# small by a third.
 _SIGNIFICANT = 4.0
 # And where the images' gains are so by chance less often than this: a wrong model that absorbs
 # something else helps some images and harms others.

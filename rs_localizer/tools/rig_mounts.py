@@ -41,7 +41,7 @@ from rs_localizer.tools.imu_mount import middle_row
 from rs_localizer.tools.readout_belief import disagreement, discrepancy
 
 # Turn rates are compared at this interval (s), over at least this time and this part of the shorter
-# recording; so many of the offsets at which they agree best are tried.
+# recording; this many of the offsets at which they agree best are tried.
 _STEP, _LEAST_SECONDS, _LEAST_SHARE, _TRIED = 0.01, 2.0, 0.3, 10
 # Rotation (rad) of the axes of two cameras of one body about their mean: half a step of the above
 # at 5 rad/s, and a degree for splines of cameras whose lens is not known yet.

@@ -23,7 +23,7 @@ from rs_localizer.tools.adjust.observe import ImagePoints
 from rs_localizer.tools.adjust.spline import LEAST_FRAMES, stretches
 from rs_localizer.tools.smoothing import PosedFrame, Smoothed, smooth
 
-# Recordings are smoothed in windows of so many seconds and so much on both sides of them: what an
+# Recordings are smoothed in windows of this many seconds and so much on both sides of them: what an
 # image farther away says is forgotten, since accelerations fade within 0.1 s. An image of 60 points
 # takes 0.18 MB of its window.
 _WINDOW_NS, _MARGIN_NS = 20_000_000_000, 2_000_000_000

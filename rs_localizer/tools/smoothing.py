@@ -39,8 +39,8 @@ from rs_localizer.tools.adjust.variables import (
     rig_state,
 )
 
-# Prior of the accelerations, worth so many numbers of this size (rad/s^2, m/s^2). A few images that
-# happen to lie on a line tell nothing of those that follow.
+# Prior of the accelerations, worth this many numbers of this size (rad/s^2, m/s^2). A few images
+# that happen to lie on a line tell nothing of those that follow.
 _NUMBERS, _USUAL = 6.0, np.array([2.0, 1.0])
 
 
@@ -61,7 +61,8 @@ def squares_and_numbers(fitted: Fit) -> tuple[Array, Array]:
     return usual * squares, 3 * len(rows.first) - unknown
 
 
-# Between images the motion is told as long as its deviations stay within so many of the usual ones.
+# Between images the motion is told as long as its deviations stay within this many of the usual
+# ones.
 _MOST_UNCERTAIN = 5.0
 # A sample is bridged where the images with a pose lie farther apart than this many intervals.
 _BRIDGED = 1.5
@@ -71,8 +72,9 @@ _NARROW_SPACING = 0.025
 # s, in which accelerations fade: hands and drones change them about twice a second.
 _FADING = 0.1
 # A frame whose points lie this much farther from the smooth motion than from its own is shaken in a
-# way that knots cannot follow: by so many times the noise, and beyond the chance (so many standard
-# deviations) of its points. Where so much of the frames is, the motion between them is none.
+# way that knots cannot follow: by this many times the noise, and beyond the chance (this many
+# standard deviations) of its points. Where so much of the frames is, the motion between them is
+# none.
 _SHAKEN, _SHAKEN_SIGMAS, _MOST_SHAKEN = 1.5, 5.0, 0.2
 # rad per readout that gyroscopes see beside a parabola: vibration.
 _ROUGH = 2e-3

@@ -18,7 +18,7 @@ from rs_localizer.tools.camera_calibration import CameraCalibration
 # Beyond this (s rms) the images' own times are mentioned.
 _WORTH_A_WORD = 5e-4
 # A ninth of the image is not covered where no keypoint lies in more than this part of its cells,
-# of which there are so many along each side.
+# of which there are this many along each side.
 _EMPTY, _CELLS = 0.5, 3
 _REGIONS = (
     ("top left", "top", "top right"), ("left", "middle", "right"),

@@ -52,7 +52,7 @@ def shutter_of(args: Options) -> tuple[float | None, str | None]:
 
 
 def look_at_images(args: Options, points: Sequence[_Point], looker: Looker) -> Looked:
-    """Look at so many images a second, and at those in which points are given."""
+    """Look at this many images a second, and at those in which points are given."""
     with opened(args, calibrated=False) as source, tqdm(
         total=source.total, unit="image", desc="look", disable=None
     ) as bar:  # fmt: skip
@@ -71,7 +71,7 @@ def look_at_images(args: Options, points: Sequence[_Point], looker: Looker) -> L
 
 _Point = tuple[str, float, float, float]
 COLMAP, POSES, REPORT = "colmap", "poses.txt", "report.md"
-# A hand's motion is held by so many images a second.
+# A hand's motion is held by this many images a second.
 _IMAGES_PER_SECOND = 15.0
 
 

@@ -222,7 +222,7 @@ def _sum_over(
     builder: Any, source: tuple[Any, int], blocks: Any,
     body: Callable[[list[Lanes]], Sequence[Number]], count: int, target: Any,
 ) -> None:  # fmt: skip
-    """Sum the terms of a body over all lanes of the first blocks of so many values each."""
+    """Sum the terms of a body over all lanes of the first blocks of this many values each."""
     totals = [_alloca_once(builder, _VECTOR) for _ in range(count)]
     for total in totals:
         builder.store(_operand(0.0), total)

@@ -18,7 +18,7 @@ from rs_localizer.pipeline.published import Broadcast
 
 # Our own come back from TF within this many.
 _REMEMBERED = 1000
-# A transform that is so many deviations away is not ours: neither from before a restart, nor of a
+# A transform that is this many deviations away is not ours: neither from before a restart, nor of a
 # recording.
 _DEVIATIONS = 5.0
 Link = tuple[str, str]  # parent and child

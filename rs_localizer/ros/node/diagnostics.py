@@ -111,7 +111,7 @@ def counts(summary: Summary, what: str, done: str) -> dict[str, str]:
 
 
 _PERIOD = 1.0  # s
-# The same state for so many periods is worth a line in the log.
+# The same state for this many periods is worth a line in the log.
 _WORTH_A_LINE = 5
 _RARELY = 128
 

@@ -24,8 +24,8 @@ from rs_localizer.tools.adjust.problem import Problem
 
 SECONDS = 1.0
 """Errors farther apart than this are taken for independent."""
-# A prior for the inflation: so many numbers that independent errors explain. What few seconds show
-# may be chance.
+# A prior for the inflation: this many numbers that independent errors explain. What few seconds
+# show may be chance.
 _DOUBT = 4.0
 # A second that tells less than this part of a number says nothing of it.
 _LEAST_TOLD = 1e-3

@@ -107,7 +107,7 @@ def cost_at(
 
 
 def cheaper(richer: Fit, plainer: Fit, parameters: float) -> bool:
-    """Return True if so many more parameters are worth it, by the noise of the richer model."""
+    """Return True if this many more parameters are worth it, by the noise of the richer model."""
     limit = (LIMIT * richer.deviation) ** 2
     costs = [float(np.sum(fitted.squared_errors.clip(max=limit))) for fitted in (plainer, richer)]
     return (costs[0] - costs[1]) / richer.deviation**2 > _COST_PER_PARAMETER * parameters

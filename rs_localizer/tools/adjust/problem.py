@@ -29,7 +29,7 @@ from rs_localizer.tools.adjust.system import (
 )
 from rs_localizer.tools.adjust.variables import MOUNT, CameraView, Unknowns
 
-# Errors beyond so many standard deviations do not count for the scale of the noise.
+# Errors beyond this many standard deviations do not count for the scale of the noise.
 _SCALE_LIMIT = 4.0
 MEDIAN = 2.0 * np.log(2.0)
 """Median of a squared error in two dimensions, in variances."""
@@ -252,7 +252,7 @@ class Problem:
 
 
 def minimise(problem: Problem, state: Unknowns, deviation: float, steps: int = _STEPS) -> Unknowns:
-    """Minimize the cost near a state, by Levenberg and Marquardt, in so many steps."""
+    """Minimize the cost near a state, by Levenberg and Marquardt, in this many steps."""
     system = problem.system(state, deviation)
     damping = _FIRST_DAMPING
     most = LIMIT**2 / 3.0 * sum(len(view.observations.points) for view in problem.views)

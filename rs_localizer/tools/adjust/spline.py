@@ -14,7 +14,7 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.tools.adjust.spline_kernels import LOCAL, ORDER, jacobians, states, steps
 
-# Without a frame for longer than this (s), or than so many usual intervals, a motion ends.
+# Without a frame for longer than this (s), or than this many usual intervals, a motion ends.
 LONGEST_GAP, MOST_INTERVALS = 0.25, 4.0
 # A stretch with fewer frames says little and costs its own controls.
 LEAST_FRAMES = 5

@@ -61,10 +61,10 @@ from rs_localizer.tools.readout_belief import ReadoutCheck, ShutterFit
 USUAL_DISTANCE = 2.5
 # Share of the keyframes that must hang together.
 _LEAST_PART = 0.5
-# Errors that landmarks share are told of so many modes. Of a walk of 12 s around a room they are
+# Errors that landmarks share are told of this many modes. Of a walk of 12 s around a room they are
 # 96 % of all (squared, in the landmarks' own deviations); they are as long as a SIFT descriptor.
 _MODES = 40
-# A landmark counts when so many views agree, and it is known to this part of its usual distance.
+# A landmark counts when this many views agree, and it is known to this part of its usual distance.
 _LEAST_SIGHTS, _MOST_DEVIATION = 3, 0.03
 
 

@@ -23,7 +23,7 @@ from rs_localizer.tools.adjust.variables import Extrinsics, MountPrior
 from rs_localizer.tools.mapping.gauge import Similarity
 from rs_localizer.tools.readout_belief import ReadoutCheck
 
-# A part of the map hangs together with another by at least so many landmarks.
+# A part of the map hangs together with another by at least this many landmarks.
 _LEAST_IMAGES, _LEAST_SHARED = 3, 3
 # Fewer observations hold a landmark on one ray, nearly.
 _LEAST_OBSERVATIONS = 3
@@ -176,7 +176,7 @@ def shared_landmarks(observations: MapObservations) -> BoolArray:
 
 
 def check(observations: MapObservations, points: int, delays: Array) -> None:
-    """Raise ValueError when the images do not make one map of so many points, and say why.
+    """Raise ValueError when the images do not make one map of this many points, and say why.
 
     Args:
         delays: (k,) s, of each camera's middle rows after their stamps.
@@ -260,7 +260,7 @@ def adjusted_part(
     )
 
 
-# A landmark in the wrong place is no outlier: keypoints count up to so many px beside the pose.
+# A landmark in the wrong place is no outlier: keypoints count up to this many px beside the pose.
 _MOST_RESIDUAL = 12.0
 
 

@@ -343,7 +343,7 @@ DRIFT = 0.01
 """Part of a deviation, so little that landmarks follow in proportion, however large that is."""
 # A landmark that is not known to this part of the map's size is not refined.
 _KNOWN = 0.1
-# Nor one that is known worse than to so many times what landmarks usually moved by: seen from one
+# Nor one that is known worse than to this many times what landmarks usually moved by: seen from one
 # side only, it would be farther off than where it was.
 _WORTH = 1.5
 

@@ -28,17 +28,17 @@ from rs_localizer.tools.mapping.structure import image_name
 
 # JPEG's quality of what COLMAP gets: at this one, errors are below a grey level.
 _QUALITY = 97
-# A view this much less sharp than those around it (so many each way) is blurred.
+# A view this much less sharp than those around it (this many each way) is blurred.
 _BLURRED, _AROUND = 0.6, 15
 # A view with fewer features is blurred, dark, or of a blank wall.
 _FEW_FEATURES = 50
 LEAST_VIEWS = 3
 # Pictures in which features move by less than this share of their size (median) show no depth.
 _LEAST_PARALLAX = 0.01
-# COLMAP gets all views of a short recording and so many a second of a long one: at a turn of 60
+# COLMAP gets all views of a short recording and this many a second of a long one: at a turn of 60
 # degrees a second, neighbours have three quarters of a picture of 60 degrees in common.
 _KEYFRAMES, _KEYFRAMES_PER_SECOND = 60, 4.0
-# After so many images without features the rest is refused: two seconds of a usual video.
+# After this many images without features the rest is refused: two seconds of a usual video.
 _EARLY_VIEWS = 30
 # Images a hair before their time are in time.
 _EARLY = 0.9
@@ -119,7 +119,7 @@ def look_through(
     shots: Iterable[Shot | Carried], looker: Looker, rate: float, moments: Sequence[float],
     done: Callable[[], object],
 ) -> Looked:  # fmt: skip
-    """Look at the images that are kept: so many a second, and the first ones at or after moments.
+    """Look at the images that are kept: this many a second, and the first ones at or after moments.
 
     Args:
         moments: s after the first image.

@@ -35,9 +35,9 @@ from rs_localizer.tools.mapping.map_keypoints import MapObservations, Start
 
 SPARSE, _TASK = "sparse", "task.json"
 _SCRIPT = Path(__file__).with_name("structure_process.py")
-# Up to so many images, each is matched with each (COLMAP's exhaustive matching: 435 pairs take 20 s
-# on two cores). Of more images, each is matched with so many that follow it and with those 2^k
-# later (its sequential matching), and every n-th with every n-th, so many of them: loops close
+# Up to this many images, each is matched with each (COLMAP's exhaustive matching: 435 pairs take 20
+# s on two cores). Of more images, each is matched with this many that follow it and with those 2^k
+# later (its sequential matching), and every n-th with every n-th, this many of them: loops close
 # there.
 _EXHAUSTIVE, _OVERLAP = 30, 10
 # COLMAP has the corner of the first pixel at 0, 0; here that is its centre.
@@ -159,7 +159,7 @@ def observed(
 
 
 def pairs_of(count: int) -> list[tuple[int, int]]:
-    """Return pairs ``i < j`` of so many images in the order of time that are worth matching."""
+    """Return pairs ``i < j`` of this many images in the order of time that are worth matching."""
     if count <= _EXHAUSTIVE:
         return [(i, j) for i in range(count) for j in range(i + 1, count)]
     steps = {*range(1, _OVERLAP + 1), *(2**k for k in range(_OVERLAP))}

@@ -190,7 +190,7 @@ def _at_the_origin(state: Unknowns, landmarks: Array) -> Unknowns:
 
 # Relative deviation of a size of which nothing is known.
 _ANY_SIZE = 0.5
-# A size is wrong beyond this and so many of its own deviations (printers stretch by up to three
+# A size is wrong beyond this and this many of its own deviations (printers stretch by up to three
 # parts in a thousand, rulers are read to half a millimetre).
 _SIZES_DIFFER, _SIGMAS = 0.015, 6.0
 # The least noise (px) from far off on, where a wrong size makes no outliers, to the last one; and

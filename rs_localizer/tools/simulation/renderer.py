@@ -63,7 +63,7 @@ def _reductions(texture: Image) -> list[Image]:
 _WITHIN = np.array([-0.25, 0.25])
 # An exposure is cut into instants between which no point moves by more than this (px) ...
 _LONGEST_STEP = 1.0
-# ... nor is it cut into more than so many.
+# ... nor is it cut into more than this many.
 _MOST_INSTANTS = 24
 # Nothing is expected to be nearer (m) when the steps are estimated.
 _NEAREST = 0.5

@@ -243,7 +243,7 @@ def _marker_plane(
 
 
 def printed(white: NDArray[np.bool_], light: tuple[int, int], texels: int) -> Image:
-    """Return the cells of a marker, each so many texels wide, in greys of paper and ink."""
+    """Return the cells of a marker, each this many texels wide, in greys of paper and ink."""
     cells = np.where(white, *light).astype(np.uint8)
     return cells.repeat(texels, axis=0).repeat(texels, axis=1)
 
