@@ -156,8 +156,8 @@ class Acceleration:
 class CalibrationErrors:
     """Errors of the lens's calibration: parts that do not overlap.
 
-    The defaults are those of a board that was held before an ordinary camera for half a minute;
-    ``rs_localizer calibrate`` writes those of its own.
+    The defaults fit a board that was held before an ordinary camera for half a minute;
+    ``rs_localizer calibrate`` writes its own deviations.
     """
 
     principal_point: float = setting(

@@ -158,7 +158,7 @@ class Localizer:
         turn: GyroRotation | None = None,
         stamps: Mapping[str, float] | None = None,
     ) -> Estimate | Failure:
-        """Estimate pose and velocities from one image, or from those of a rig.
+        """Estimate pose and velocities from one image, or from the images of a rig.
 
         Args:
             points: (n,3) in the map frame, metres. For a rig ``{name: (points, pixels)}``, or
@@ -173,9 +173,8 @@ class Localizer:
             stamps: for a rig, times (s) at which the first row of each image was exposed, relative
                 to anything; None: all at once.
 
-        Returns:
-            an :class:`Estimate`, of a rig a :class:`RigEstimate`, or a :class:`Failure` with its
-            reason. Same seed and same input give the same result.
+        Returns: an :class:`Estimate` (a :class:`RigEstimate` for a rig), or a :class:`Failure` with
+            its reason. Same seed and same input give the same result.
 
         Raises:
             ValueError: wrong shapes, values that are not finite, or a prior or turn where
@@ -326,7 +325,7 @@ class Localizer:
     ) -> Array:
         """Return the distances (n,) px between pixels and the points projected by a motion.
 
-        Each at the time of the row that it is shown in; NaN behind the camera. Arguments as of
+        Each point is projected at the time of its own row; NaN behind the camera. Arguments as of
         :meth:`localize`.
         """
         exposure, counts, landmarks, seen, _ = self._sights(points, pixels, None, stamps)
@@ -392,7 +391,7 @@ class Localizer:
     def _own_terms(self, observed: Observed, prior: Prior) -> PriorTerms:
         """Return the prior of a frame from itself and from the velocities of earlier frames.
 
-        Their poses, and so the predicted one, are off by the same calibration as this one.
+        Poses of earlier frames, and so the predicted one, have the calibration error of this frame.
         """
         if prior.covariance is None:
             return observed.terms

@@ -38,10 +38,10 @@ def earlier_result(
     Args:
         mark: a file that each result has.
         place: of the result; None: ``--out``.
-        names: of what a result has; None: all that is there.
+        names: names of the parts of a result; None: everything in the directory.
 
     Raises:
-        ValueError: when what is there is not to be replaced, or is something else.
+        ValueError: the directory must not be replaced, or is something else.
     """
     out: Path = place or args.out
     resume_results([out])

@@ -360,7 +360,7 @@ def _next(args: Options, lens: bool, shape: Path | None) -> str:
     """Return the command that makes poses of this recording with the calibration.
 
     Args:
-        lens: whether that of the file takes the place of camera_info's.
+        lens: whether the lens of the file replaces the one in camera_info.
         shape: the map of images; None: the recording has matches.
     """
     out = _out(args)

@@ -3,7 +3,7 @@
 """``rs_localizer COMMAND``: finds the command, turns its faults into one line and an exit code.
 
 Exit codes: 0 done, 1 the work failed, 2 wrong usage; 130 after Ctrl-C, 143 after SIGTERM, and 141
-when who reads the output goes away (``| head``).
+    when the reader of the output has closed it (``| head``).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _STEERING = {
 
 
 class Command(NamedTuple):
-    """A command: what it does, and a line that a user can try.
+    """A command: a description, and a line that a user can try.
 
     Its module, imported only when it is chosen, offers the dataclass ``Options`` and
     ``run(options)``, which prints, and returns what ``--json`` prints instead, or None.

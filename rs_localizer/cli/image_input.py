@@ -109,7 +109,7 @@ def print_telemetry(args: ImageOptions, used: float | None = None) -> None:
 
     Args:
         args: of the video.
-        used: the readout time that was measured, s; None: that of the settings is used.
+        used: the measured readout time, s; None: the one of the settings is used.
     """
     path = args.recording
     settings = None if used is not None else build(shutter_values(args))

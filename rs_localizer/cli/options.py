@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Options of a command: a dataclass, whose fields, types and texts make its parser.
 
-The class of a command derives from those of options that several commands share; the docstring of
-each is the title of its group in the help.
+The class of a command derives from classes of options that several commands share. The docstring of
+each class is the title of its group in the help.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def argument(help: str, metavar: str, default: Any = MISSING) -> Any:  # noqa: A
     """Declare a field that is given by its place; a list takes one or more.
 
     Args:
-        help: what it is.
+        help: description.
         metavar: its name in the help.
         default: makes it optional; ``list``: none or more.
     """
@@ -59,7 +59,7 @@ def option(
     """Declare a field that is given by ``--its-name``.
 
     Args:
-        help: what it does; a default that is no None, False or empty list is added.
+        help: description; a default that is not None, False or an empty list is added.
         metavar: of its value; of a list whose values stand behind one flag, ``ID ...``.
         default: ``list`` for one that may be repeated; of a switch, False.
         flag: another name, such as ``-p``, or several.
@@ -133,7 +133,7 @@ class CommonOptions:
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong by a :class:`UsageError`, with the option that may be meant."""
+    """Reports faults by a :class:`UsageError`, with the option that may be meant."""
 
     def __init__(self, **words: Any) -> None:
         words |= {"allow_abbrev": False}

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``rs_localizer readout``: what others say of a camera's readout time."""
+"""``rs_localizer readout``: published readout times of a camera."""
 
 from __future__ import annotations
 

@@ -270,7 +270,7 @@ def _print_summary(tally: Tally, config: NodeConfig, out: Path, timed: bool) -> 
 
 
 def _replay_all(options: Options) -> None:
-    """Replay many recordings, each into a folder of its own; what is complete is not done again."""
+    """Replay many recordings, each into a folder of its own, except those that are complete."""
     out = options.out
     if out is None:
         raise UsageError("many recordings need --out DIR, for a folder of each")

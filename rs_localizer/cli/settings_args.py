@@ -26,7 +26,7 @@ def given_values(args: Any) -> dict[str, Any]:
         args: with ``params`` and ``assignments``, and ``calibration`` where there is a lens.
 
     Raises:
-        UsageError: for what is no setting, or a wrong value, with where it was given.
+        UsageError: for an unknown setting, or a wrong value, with its source.
     """
     lens, values = getattr(args, "calibration", None), dict[str, Any]()
     sources: dict[str, Callable[[], Mapping[str, Any]]] = {
@@ -52,7 +52,7 @@ def remapped(options: Any, known: Sequence[str] = (*INPUTS, IMAGE)) -> dict[str,
     """Return the topics that ``-r`` gives, by input; images are one.
 
     Raises:
-        UsageError: for what is no input.
+        UsageError: for an unknown input.
     """
     topics = dict[str, str]()
     for text in options.remaps:

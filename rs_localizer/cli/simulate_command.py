@@ -162,7 +162,7 @@ class Options(MotionOptions, CameraOptions, ResultOptions):
 
 
 def camera_of(args: Options) -> Camera:
-    """Return the camera of ``--camera``, or a webcam; its shutter is what the options say."""
+    """Return the camera of ``--camera``, or a webcam, with the shutter of the options."""
     lens = Camera(640, 480, pinhole_matrix(500.0, 500.0, 319.5, 239.5), readout_time=_READOUT_TIME)
     values = dict[str, Any]()
     if args.camera is not None:
@@ -248,7 +248,7 @@ def run(args: Options) -> dict[str, object]:
 
 
 class _Recorder:
-    """Writes what the cameras see of a world."""
+    """Writes the views of cameras in a world."""
 
     def __init__(self, args: Options) -> None:
         self._args, self._motion = args, motion_of(args)

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Camera: raw pixels to bearings and row times, and back.
 
-A raw pixel is what the driver delivers: distorted, with the centre of the first pixel at (0, 0),
-possibly binned and cropped. Its bearing comes from the undistorted position, its row time from
+A raw pixel is a pixel of the driver's image: distorted, with the centre of the first pixel at (0,
+0), possibly binned and cropped. Its bearing comes from the undistorted position, its row time from
+the raw row of the full sensor: distortion moves light between rows, not rows in time.
 the raw row of the full sensor: distortion moves light between rows, not rows in time.
 """
 
@@ -117,7 +118,7 @@ _LONGEST_IN_WIDTHS = 10.0
 
 
 def _check_unit(K: Array, width: int, height: int) -> None:
-    """Refuse a camera matrix in widths and heights of the image, as of normalized calibrations."""
+    """Refuse a camera matrix in widths and heights of the image (a normalized calibration)."""
     is_middle = np.all(np.abs(K[:2, 2] - 0.5) < _BESIDE)
     if is_middle and min(width, height) > 2 and max(K[0, 0], K[1, 1]) < _LONGEST_IN_WIDTHS:
         raise ValueError(

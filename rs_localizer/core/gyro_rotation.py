@@ -35,7 +35,7 @@ _UNKNOWN = np.diag(np.full(3, np.inf))
 class GyroRotation:
     """The camera's rotation as its gyroscope measured it; points estimate the motion beside it.
 
-    Times are row times, rates are body rates in rad per readout, along the camera axes of then.
+    Times are row times. Rates are body rates in rad per readout, in the camera axes of the moment.
     """
 
     tau: Array  # (k,) of the samples, increasing, k >= 2
@@ -156,7 +156,7 @@ def _turn_at_rows(
 def late_at(tau: float, times: Array1, cubics: Array3, parabola: Array2) -> tuple[Array, Array]:
     """Turn (3,) and rate (3,) at a row time that a delay of one readout would leave.
 
-    What a motion under constant acceleration follows is told by the points and left out.
+    The part that a constant acceleration can follow is left out: points determine it.
     """
     time = min(max(tau, times[0]), times[-1])
     rate, change = rate_at(time, times, cubics), change_at(time, times, cubics)

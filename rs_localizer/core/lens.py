@@ -32,7 +32,7 @@ _remembered = lru_cache(64)
 def corner_of(camera: Camera) -> float:
     """Return the distance of the image's corners from its middle, in focal lengths.
 
-    A region of the sensor may lie far from the axis: then that of its farthest corner from there.
+    If the axis lies outside the delivered region, the farthest corner from the axis counts.
     """
     roi, K = camera.roi, camera.K
     if roi is None:

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lens laws: where a bearing falls on the sensor, and back.
 
-Those of sensor_msgs/CameraInfo are here and in :mod:`rs_localizer.core.equidistant`;
+The laws of sensor_msgs/CameraInfo are here and in :mod:`rs_localizer.core.equidistant`;
 :mod:`rs_localizer.core.eucm` and :mod:`rs_localizer.core.double_sphere` have Kalibr's names. A new
 law is a file with its own :class:`LensLaw`, and a row in
-:class:`rs_localizer.core.camera.DistortionModel`; all else reads what stands here.
+:class:`rs_localizer.core.camera.DistortionModel`.
 """
 
 from __future__ import annotations

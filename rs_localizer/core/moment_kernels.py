@@ -27,7 +27,7 @@ def pose_of(
         motion: at the middle row, with the known turn.
         shake: (k,3) coefficients.
         joint: (18 + 3 k,18 + 3 k) covariance of motion and coefficients.
-        turn: what a gyroscope knows.
+        turn: rotation by a gyroscope.
         tau: row time.
         beyond: variance of the turn (rad^2) that no row has seen.
     """

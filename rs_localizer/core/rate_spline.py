@@ -7,7 +7,7 @@ Between two samples the camera turns by ``exp(-theta)``, with Magnus' series up 
 
     theta(h) = I + I x M / h,   I = integral of omega,   M = integral of (t - h/2) omega
 
-both in closed form for a cubic. The axes are those of the camera at each moment.
+Both are in closed form for a cubic. The axes are the camera's at each moment.
 """
 
 from __future__ import annotations

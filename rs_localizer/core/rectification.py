@@ -1,14 +1,14 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Pixels as a global shutter would have seen them: what the rows' motion did, undone.
+"""Pixels as a global shutter would have seen them.
 
-With the poses ``R, t`` camera_from_map of two row times, what the camera has before it at ``tau``,
-the one of its pixel, it has at another one ``tau'`` at
+Let ``R, t`` be the poses camera_from_map at two row times. A point that the camera sees at ``tau``,
+the row time of its pixel, lies at another row time ``tau'`` at
 
     camera_point(tau') = Q camera_point(tau) + t(tau') - Q t(tau),   Q = R(tau') R(tau)^T
 
-The poses are those of the whole motion: with accelerations, and with what shakes the camera as far
-as that is known. Its depth is what a pixel alone does not say; far away, only the rotation counts.
+The poses include accelerations, and vibration as far as it is known. A pixel alone does not
+determine the depth; for distant points only the rotation counts.
 """
 
 from __future__ import annotations

@@ -41,9 +41,9 @@ class Rig:
 
     Args:
         cameras: by their names, each with its shutter.
-        camera_from_rig: rotation (3,3) and translation (3,) m of each camera, with
-            ``X_camera = R X_rig + t``. The rig's origin belongs near the cameras: what is assumed
-            of its speed is assumed of that point.
+        camera_from_rig: rotation (3,3) and translation (3,) m of each camera, with ``X_camera = R
+            X_rig + t``. Put the rig's origin near the cameras: the prior of the velocity holds for
+            this point.
         time_offset: s to add to the stamps of a camera; absent: 0.
 
     Raises:
@@ -359,9 +359,9 @@ class ByCamera(np.ndarray[Any, Any]):
 class RigEstimate(Estimate):
     """An accepted pose and velocity of a rig; true in a condition.
 
-    As an :class:`Estimate`, of the rig in place of the camera: rig_from_map at ``time``, velocities
-    per ``span``. ``inliers`` and ``residuals`` hold the points of all cameras, one after the other;
-    those of one camera are ``inliers["front"]``.
+    It is an :class:`Estimate` of the rig instead of the camera: rig_from_map at ``time``,
+    velocities per ``span``. ``inliers`` and ``residuals`` hold the points of all cameras, one after
+    the other; ``inliers["front"]`` are those of one camera.
     """
 
     time: float = 0.0  # s, middle of all exposures, by the clock of the stamps

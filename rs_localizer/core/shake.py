@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""In-frame turn: what the camera turns beside a motion of constant acceleration.
+"""In-frame rotation of the camera beside a motion of constant acceleration.
 
 A sum of cosines and sines of the row time at fixed frequencies, half a cycle per readout apart:
 vibration of any spectrum, as a Gaussian process in row time. Value and slope at the middle row are
@@ -33,7 +33,7 @@ smaller than 1e-4 of their squares, and turn the middle row as little."""
 def _resolved() -> tuple[Array, Array]:
     """Return combinations (28,18) of the functions, and the functions as their sums (18,28).
 
-    Those of an ordinary vibration are independent of each other, and of size 1.
+    The combinations of an ordinary vibration are independent, and of size 1.
     """
     tau, sizes = np.linspace(-0.5, 0.5, 401)[:, None], np.repeat(TYPICAL_SIZES, 2)
     shown = np.empty((len(tau), FUNCTIONS))

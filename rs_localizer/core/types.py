@@ -32,13 +32,13 @@ _LAST_ROW = 0.55
 class Estimate(Motion):
     """An accepted pose and velocity; true in a condition.
 
-    ``covariance`` orders its 12 rows: rotation (the camera turns by exp of it, in its own axes),
-    camera position in camera axes, angular velocity, linear velocity; units as the fields.
-    Accelerations and shaking are averaged out of it; ``joint_covariance`` has them behind, in the
-    order of ``rs_localizer.core.state`` and of ``shake``. The former has the errors of the
-    calibration, which are the same in all frames, and what belongs to this frame alone, as of
-    vibration that hides in the noise; the latter is what goes on to the next frame. With
-    ``refinement`` none all of them are NaN.
+    ``covariance`` has 12 rows: rotation (the camera rotates by exp of it, in its own axes), camera
+    position in camera axes, angular velocity, linear velocity, in the units of the fields.
+    Accelerations and vibration are averaged out of it. ``joint_covariance`` has them at its end, in
+    the order of ``rs_localizer.core.state`` and of ``shake``. ``covariance`` includes the errors of
+    the calibration, which are the same in all frames, and errors of this frame alone, as of hidden
+    vibration. ``joint_covariance`` goes on to the next frame. With ``refinement`` none all of them
+    are NaN.
     """
 
     inliers: BoolArray  # (n,)

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Results that appear whole or not at all, however their making ends.
 
-They are made in a workplace: a hidden folder beside them, or within a folder that is there already
-and may be a mount point, which nobody can rename. When they are whole and on the disk, a journal in
-the workplace says which names are to change, and the names change. A process holds a lock on its
-workplace. One without a lock is that of a dead process: :func:`resume` changes the names that its
-journal still asks for, and removes it.
+Results are made in a workplace: a hidden folder beside them, or within an existing folder, which
+may be a mount point that nobody can rename. When they are whole and on the disk, a journal in the
+workplace lists the names that change, and then the names change. A process holds a lock on its
+workplace. A workplace without a lock belongs to a dead process: :func:`resume` finishes the changes
+of its journal, and removes it.
 """
 
 import contextlib

@@ -138,7 +138,7 @@ class BagReader:
 def open_bag(path: Path | str) -> Iterator[BagReader]:
     """Open a rosbag2 directory, a file of one, or a ROS 1 bag.
 
-    What a file is, its first bytes say (:mod:`rs_localizer.io.containers`).
+    The first bytes of a file decide its kind (:mod:`rs_localizer.io.containers`).
 
     Raises:
         BagError: when there is no such recording, or it is damaged or empty.
@@ -227,7 +227,7 @@ def _as_ros2(message: Any, type_name: str) -> Any:
 class BagWriter:
     """Writes a rosbag2 directory; a context manager.
 
-    What was written before an exception (Ctrl-C among them) stays readable; without any message,
+    Messages that were written before an exception (also Ctrl-C) stay readable. Without any message,
     nothing is left (see :mod:`rs_localizer.io.atomic_files` for all or nothing).
 
     Args:

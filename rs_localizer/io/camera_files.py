@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibration files of other programs -> Camera.
 
-Which program wrote a file, what it holds tells. Of a file of several cameras, the wanted one's name
-stands behind a ``#``: ``camchain.yaml#cam1``.
+The content of a file tells which program wrote it. Of several cameras in a file one is chosen after
+a ``#``: ``camchain.yaml#cam1``.
 """
 
 from __future__ import annotations

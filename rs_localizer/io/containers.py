@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of recordings, known by what they hold and not by their names, as rosbags can open them.
+"""Files of recordings, recognized by their content and not by their names, for rosbags.
 
 rosbags goes by suffixes and by ``metadata.yaml``. Here a file that is packed is unpacked, and one
 that is named otherwise gets a name. Few bytes of a recording stand for no gigabytes: rosbags'
@@ -76,11 +76,11 @@ def storage(
         path: of a file, or of a folder.
         files: of the folder, as its metadata lists them; None: it has none that can be used.
         packed: whether they, or their messages, are packed; rosbags would unpack without a limit.
-        unpack: writes what a .zst file holds to another one.
+        unpack: unpacks a .zst file to another file.
 
     Raises:
-        ValueError: for what is no recording, an MCAP that is cut off or not of ROS 2, or a file
-            that claims or computes more than it holds.
+        ValueError: for a file that is no recording, an MCAP that is cut off or not of ROS 2, or a
+            file that claims or computes more than it holds.
     """
     listed = files if files and all(file.is_file() for file in files) else None
     if listed and not packed:

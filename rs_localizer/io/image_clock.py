@@ -24,7 +24,7 @@ class ImageClock:
 
     Args:
         rate: images per second instead of the file's own times; None: these.
-        missing: what is to be said of images that could not be read.
+        missing: sentence on images that could not be read.
         captured: images per second that the camera took, by a note of the file; None: unknown.
     """
 

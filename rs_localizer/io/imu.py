@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""sensor_msgs/Imu -> what a gyroscope and an accelerometer have measured."""
+"""sensor_msgs/Imu -> readings of a gyroscope and an accelerometer."""
 
 import math
 from dataclasses import dataclass

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shared parts of readers of messages: the error, the stamp, and the headers.
 
-Messages are taken by their attributes, so that those of rclpy and those of rosbags, which differ
-only in their containers, are read by the same code.
+Messages are read by their attributes. So the same code reads messages of rclpy and of rosbags,
+which differ only in their containers.
 """
 
 from collections.abc import Callable

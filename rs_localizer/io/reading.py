@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Readers of text, YAML and JSON of people and programs, all with limits.
 
-Files come from others. What is larger than anybody writes, packs much more than it holds, or kills
-the library that reads it, is refused in a sentence.
+Files come from others. A file that is larger than anybody writes, packs much more than it holds, or
+crashes the library that reads it, is refused in a sentence.
 """
 
 import contextlib
@@ -181,7 +181,7 @@ def run_limited(
 
     Args:
         script: run by its path.
-        task: what the script finds in the JSON file.
+        task: content of the script's JSON file.
         memory: bytes that it may allocate.
         seconds: that it may work.
 

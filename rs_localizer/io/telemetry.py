@@ -151,8 +151,9 @@ def _plausible(times: Array, rates: Array) -> tuple[Array, Array]:
 def _of_orientations(rows: Array) -> tuple[Array, Array]:
     """Return times (n,) s and rates (n,3) rad/s of a camera that writes orientations (DJI).
 
-    The library has orientations of a camera with x right, y up and z back. GoPros write both: rates
-    from their orientations are those of the gyroscope, by scales of 1.00 +- 0.01 about each axis.
+    The library has orientations of a camera with x right, y up and z back. GoPros write
+    orientations and rates: the rates from the orientations equal the gyroscope's, with scales of
+    1.00 +- 0.01 about each axis.
 
     Args:
         rows: (k,5) ms, x y z w; one of a time counts.
@@ -181,8 +182,8 @@ def _number(value: Any) -> float:
 def _spread(forces: Array, times: Array) -> Array:
     """Interpolate specific forces (k,3) at the times (n,) of the gyroscope.
 
-    The library numbers both alike, so that those of a slower accelerometer come too early: they
-    are as long as the gyroscope's, at a rate of their own.
+    The library numbers both alike, so that the samples of a slower accelerometer come too early.
+    Both cover the same time, at rates of their own.
     """
     if len(forces) < 2:
         return np.full((len(times), 3), np.nan)

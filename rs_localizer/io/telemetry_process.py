@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """telemetry-parser at work, run by its path (see ``limited.py``): a video -> its numbers and words.
 
-It takes what a file claims at its word: sizes of gigabytes, and panics of its Rust, come of
-damaged files. Whoever reads what is left here checks it; this only brings it into arrays.
+The library believes the sizes that a file claims: damaged files cause gigabytes and panics of its
+Rust. The reader of the result checks it; this process only makes arrays of it.
 """
 
 import json

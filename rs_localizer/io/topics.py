@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The names of topics, relative to a node's namespace.
 
-What the inputs are: :mod:`rs_localizer.pipeline.inputs`; the outputs: :mod:`.outputs`.
+The inputs are in :mod:`rs_localizer.pipeline.inputs`, the outputs in :mod:`.outputs`.
 """
 
 # Inputs of the localizer.

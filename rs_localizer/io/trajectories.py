@@ -94,7 +94,7 @@ def read_tum(path: Path | str) -> Trajectory:
 
 
 def write_tum(path: Path | str, trajectory: Trajectory, about: Sequence[str] = ()) -> None:
-    """Write a TUM file; what is read back is the same to the last bit.
+    """Write a TUM file, which reads back the same to the last bit.
 
     Args:
         about: lines of comment before the data.

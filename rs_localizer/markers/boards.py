@@ -39,9 +39,9 @@ _EVERY, _SIZES = 10, 9
 def find_chessboard(image: Gray, board: Chessboard, previous: Array | None = None) -> Array | None:
     """Return the pixels (n,2) of a chessboard's inner corners, in the order of ``board.points``.
 
-    The board is taken for one whose top left square is black. When it looks the same turned by
-    half (columns + rows is even; a square board also turned by a quarter), the order is the one
-    that is closest to the ``previous`` corners; without them, the one that reads as text does.
+    The top left square of the board is assumed to be black. If the board looks the same rotated by
+    half (columns + rows is even; a square board also by a quarter), the order closest to the
+    ``previous`` corners is taken; without them, the order that reads like text.
 
     Returns:
         None when the whole board is not seen.
@@ -107,7 +107,7 @@ def _no_saddles(smooth: Gray, board: Chessboard, corners: Array) -> NDArray[np.b
 
 
 class BoardSizes:
-    """Looks now and then whether a chessboard has the size that it is said to have.
+    """Checks from time to time whether a chessboard has the given size.
 
     Args:
         marker_map: with the chessboard, if there is one.
@@ -120,7 +120,7 @@ class BoardSizes:
         self._sizes: list[tuple[int, int]] = []
 
     def count_board(self, image: Gray, complete_board: bool) -> None:
-        """Take an image, and whether the board as it is said to be was found in it."""
+        """Count an image, and whether the board of the given size was found in it."""
         self._images += 1
         if self._board is None or self._images <= self._next or len(self._sizes) >= _SIZES:
             return

@@ -56,8 +56,9 @@ class Detections:
 class MarkerDetector:
     """Finds the markers and boards of a map.
 
-    What is found of the map depends on the image alone (and for a board that looks the same turned
-    on the image before); of large families, :attr:`Detections.unknown` is told now and then only.
+    Detections of the map depend on the image alone; for a board that looks the same rotated, also
+    on the image before. For large families :attr:`Detections.unknown` is only filled from time to
+    time.
 
     Args:
         marker_map: what to look for.

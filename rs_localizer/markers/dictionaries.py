@@ -1,11 +1,11 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""OpenCV's markers, the same from OpenCV 4.6 to 5: their patterns, and where an image shows them.
+"""Markers of OpenCV, alike from OpenCV 4.6 to 5: their patterns and their detection.
 
-OpenCV holds the AprilTag patterns upside down (4.x and 5.0; a later one will not, see
-https://github.com/opencv/opencv/pull/28823), so that it draws them turned by half and gives their
-corners from the bottom right one on. Here, upright is what the family's own authors print: the
-pattern of id 0 is known, and by it every dictionary is turned.
+OpenCV holds the AprilTag patterns upside down (4.x and 5.0; a later version will not, see
+https://github.com/opencv/opencv/pull/28823). It draws them rotated by half and gives their corners
+from the bottom right one on. Here a marker is upright as its family's authors print it: the pattern
+of id 0 is known, and every dictionary is rotated by it.
 """
 
 from collections.abc import Collection

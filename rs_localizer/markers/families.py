@@ -20,7 +20,7 @@ class Family:
 
     @property
     def cells(self) -> int:
-        """Cells along a side, with the border: what a marker's size spans."""
+        """Cells along a side, with the border, as a marker's size counts."""
         return self.bits + 2 * self.border
 
     @property

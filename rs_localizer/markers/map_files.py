@@ -1,9 +1,10 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of marker maps: our own YAML (an example is in docs/maps.md) and those of other programs.
+"""Files of marker maps: our own YAML (an example is in docs/maps.md) and files of other programs.
 
-Which it is, what a file holds tells. Poses are of the print's frame: origin in its middle, x to the
-right, y up, z towards the viewer; corners go from the top left one clockwise, from the front.
+The content of a file decides its kind. Poses are of the print's frame: origin in its middle, x to
+the right, y up, z towards the viewer. Corners go clockwise from the top left one, seen from the
+front.
 
 * Bundles of apriltag_ros (ROS 1), YAML: m; axes of a tag are those of a print
   (AprilRobotics/apriltag_ros #156); what is missing of a pose is that of the origin.

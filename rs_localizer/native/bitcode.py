@@ -158,7 +158,7 @@ class _Linker:
         self._modules.append(module.as_bitcode())
 
     def merged(self) -> Any:
-        """Return all in one module, without what nobody calls."""
+        """Return all modules in one, without unused functions."""
         for library, _ in list(self._shared.values()):
             with global_compiler_lock:
                 library._ensure_finalized()
@@ -177,7 +177,7 @@ class _Linker:
         return merged
 
     def table(self) -> str:
-        """Return the C of what the module offers."""
+        """Return the C source of the module's table of entries."""
         return "\n".join([
             '#include "runtime.h"',
             *self._externals,

@@ -256,8 +256,8 @@ def _compiled(level: str, key: str) -> Path:
 def assemble(wanted: Sequence[str]) -> None:
     """Write the kernels of some levels as assembler text into :data:`ASSEMBLED`.
 
-    What is there is built without Numba and LLVM, by a C compiler alone: build farms of
-    distributions have no Numba, and take no binaries.
+    The build takes them without Numba and LLVM, by a C compiler alone: build farms of distributions
+    have no Numba, and take no binaries.
     """
     os.environ["RS_LOCALIZER_KERNELS"] = "build"
     from rs_localizer.native.bitcode import assembler_text

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels run by Numba: for who edits them, and for the build, which compiles them all.
+"""Kernels run by Numba, after an edit and for the build, which compiles all of them.
 
 If the native module fits the sources, nothing of this is imported. Machine code is kept in the
 checkout, in a folder named by the digest of a kernel's file and of all files that it imports.
@@ -67,7 +67,7 @@ class _CompiledEntry(CPUDispatcher):
 
 
 def uncallable(name: str) -> str:
-    """Return what a call of a kernel that is no entry is refused with."""
+    """Return a function that refuses the call of a kernel that is no entry."""
     return f"{name} is called by kernels alone; Python calls what is declared as @entry"
 
 
@@ -168,7 +168,7 @@ class _Implementation(CompileResultCacheImpl):
 
 
 class _Cache(FunctionCache):
-    """Machine code that nobody else can have put there; what is wrong is compiled again."""
+    """Machine code in a folder that nobody else can write to; a wrong file is compiled again."""
 
     _impl_class = _Implementation
 

@@ -54,7 +54,7 @@ class DetectError(ValueError):
 
 @dataclass(slots=True)
 class Extraction:
-    """Counts of what became of the images, and what they show."""
+    """Counts of used and refused images, and their content."""
 
     images: int = 0
     counts: list[int] = field(default_factory=list)  # keypoints or corners, where there are any
@@ -95,7 +95,7 @@ def record(
     Args:
         shots: the images, and what else of their recording is to be kept.
         done: called after each image.
-        tell: called when many images in the beginning show nothing, with what they show instead.
+        tell: called if many images at the beginning show nothing, with what they show instead.
 
     Raises:
         DetectError: when no image shows anything, or images and calibration differ in size.
@@ -147,7 +147,7 @@ def _readable(
 
 
 class _MarkerTally:
-    """Counts what the images show of a map."""
+    """Counts the parts of a map that images show."""
 
     def __init__(self, detector: FrameDetector, found: Extraction) -> None:
         marker_map = detector.map
@@ -220,7 +220,7 @@ class _MarkerTally:
 
 
 class Cameras:
-    """The camera of each image; mostly that of the one before."""
+    """The camera of each image, mostly the camera of the image before."""
 
     def __init__(self, scan_direction: str) -> None:
         self._scan_direction = scan_direction

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Many recordings: one function, mapped over them here or by Dask; what is done is skipped."""
+"""Many recordings: one function, mapped over them here or by Dask; finished ones are skipped."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def tasks_of(
     """Return a task for each recording, with a folder of its own below ``out``.
 
     Args:
-        recordings: what is localized; one that stands twice is done once.
+        recordings: to be localized; duplicates are localized once.
         out: of all results.
         work: a function that can be pickled.
         settings: all that a result depends on beside the files, as text.
@@ -153,7 +153,7 @@ def perform_all(
     """Yield the outcome of each task, as they come; closing the iterator stops all.
 
     Args:
-        tasks: what is not done yet.
+        tasks: those that are not done yet.
         scheduler: address of Dask's; None: on this machine.
         workers: processes of this machine that Dask starts; None: this process alone.
 
@@ -249,7 +249,7 @@ def do_all(
 
 
 def _summarize(outcomes: Mapping[Task, Outcome], file: Path) -> None:
-    """Write the table; it says the same whoever did the work, in whatever order it was done."""
+    """Write the table, which is the same with any number of workers and in any order."""
     known = [{} if isinstance(outcome, str) else outcome for outcome in outcomes.values()]
     columns = list(dict.fromkeys(name for figures in known for name in figures))
     with atomic_files(file) as (part,), part.open("w", encoding="utf-8", newline="") as text:

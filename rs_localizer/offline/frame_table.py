@@ -226,7 +226,7 @@ def localize_recording(
 
     Args:
         source: the recording.
-        map: of keypoints; None: that of the recording, if it has one.
+        map: map for keypoints; None: the one of the recording, if it has one.
         settings: parameters by dotted name (``{"readout_time": 0.03}``), or a params file.
 
     Returns:

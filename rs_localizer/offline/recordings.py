@@ -46,7 +46,7 @@ def read_recording(
 ) -> Recorded:
     """Read the correspondences of a recording; keypoints are matched with its or a given map.
 
-    The camera is that of the last usable camera_info.
+    The last usable camera_info gives the camera.
 
     Raises:
         RecordingError: without correspondences or camera_info, or with several cameras.
@@ -141,7 +141,7 @@ def camera_topics(
     """Return the topics of each camera of a rig by the names of their inputs.
 
     Args:
-        cameras: their names, which stand before those of the topics; None: all that there are.
+        cameras: names, which are prefixes of the topics; None: all cameras.
 
     Raises:
         RecordingError: when one has no camera_info or nothing to localize.

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A frame from message to pose: what the live node and the offline replay share.
+"""A frame from message to pose, shared by the live node and the offline replay.
 
 Both feed their messages to a :class:`FrameLocalizer` and publish what
 :func:`rs_localizer.io.outputs.messages` makes of the result, so that both say the same. What a
@@ -83,7 +83,7 @@ class FrameLocalizer(ABC):
 
     Args:
         config: settings; assigning :attr:`config` changes them from the next frame on.
-        notice: told of what is odd but no refusal.
+        notice: called with oddities that are no refusal.
         transforms: where the cameras are on ``base_frame``; asked once a frame, so that a mounting
             may change and move. Without it there is none.
 
@@ -114,7 +114,7 @@ class FrameLocalizer(ABC):
 
     @abstractmethod
     def _forget_frames(self) -> None:
-        """Forget what is kept of the previous frames beside their motion."""
+        """Forget the previous frames, except their motion."""
 
     @abstractmethod
     def flush(self) -> list[Localized | Refusal]:

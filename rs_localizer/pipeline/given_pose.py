@@ -82,7 +82,7 @@ def read_given_pose(message: Any) -> GivenPose:
 
 
 class PosePrior:
-    """Keeps what was given until a frame has been found by it, or it is too old.
+    """Keeps a given pose until a frame has been found by it, or it is too old.
 
     Args:
         notice: told why it is not used.

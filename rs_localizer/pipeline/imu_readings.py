@@ -1,10 +1,10 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""IMU readings for frames: those of their exposure, in the camera's axes.
+"""IMU readings of the exposures of frames, in the camera's axes.
 
-Node and replay share it. Readings may be added from any thread; all else belongs to the one that
-localizes. What a frame gets depends on stamps alone, not on when a reading came, so that a
-recording gives the same poses live and offline.
+Node and replay share this module. Readings may be added from any thread; all other calls belong to
+the thread that localizes. The readings of a frame depend on stamps alone, not on their time of
+arrival, so that a recording gives the same poses live and offline.
 """
 
 import math
@@ -292,7 +292,7 @@ def in_camera_axes(
 ) -> ImuSamples:
     """Convert readings from the axes of the IMU to samples in those of the camera.
 
-    Lever arms do not matter to a rate; what they do to a force is left out.
+    Lever arms do not change a rate; their effect on a force is neglected.
 
     Args:
         readings: n of them, in the IMU's axes.

@@ -23,7 +23,7 @@ class Landmarks:
     """The map that keypoints are matched with, as soon as there is one.
 
     Args:
-        notice: told what is odd.
+        notice: called with oddities.
     """
 
     def __init__(self, notice: Notify) -> None:

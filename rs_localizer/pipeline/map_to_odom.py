@@ -133,7 +133,7 @@ class Decision:
 
 
 def decide(settings: Settings, state: CorrectionState, seen: Odometry | FoundPose) -> Decision:
-    """Take an observation; pure: the same arguments give the same decision."""
+    """Decide after an observation; pure: equal arguments give equal decisions."""
     now = seen if isinstance(seen, Odometry) else seen.at
     last = state.held.newest.since if state.held and isinstance(seen, FoundPose) else state.newest
     if last and now.stamp_ns < last.stamp_ns - _RESTART and not isinstance(seen, Click):

@@ -68,7 +68,7 @@ class FrameDetector:
 
     Args:
         config: its settings.
-        notice: told of what is wrong but stops nothing.
+        notice: called with faults that stop nothing.
         marker_map: instead of the file of the settings.
 
     Raises:

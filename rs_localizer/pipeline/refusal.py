@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A message without a result, and why; who is told what is odd."""
+"""A refused message and its reason; the call that reports oddities."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Images of several cameras become frames: by their stamps, however fast they come.
 
-A frame holds one image of each camera whose exposures have their middles within ``rig.window``. It
-is complete when all cameras that are awaited have come, or when one comes that belongs to the next
-frame. A camera that has been missing from some frames in a row is no longer awaited until it comes
-again. What is left out is said: an image that comes after its frame, and one of a clock that is
+A frame holds one image of each camera; the middles of their exposures lie within ``rig.window``. It
+is complete when all awaited cameras have come, or when an image of the next frame comes. A camera
+that has been missing from some frames in a row is no longer awaited until it comes again. A notice
+names images that are left out: those that come after their frame, and those of a clock that is
 ahead of the others, or has gone back alone. When all clocks go back, a recording has started over.
 :class:`RigFrames` localizes the frames.
 """

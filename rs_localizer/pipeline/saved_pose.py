@@ -20,7 +20,7 @@ _ORTHONORMAL = 1e-6
 
 
 def save_pose(file: Path, map_frame: str, map_from_body: Transform, covariance: Array) -> None:
-    """Write a pose; what was there stays if the disk takes no more (:class:`.OutputError`)."""
+    """Write a pose; the last one stays if the disk is full (:class:`.OutputError`)."""
     text = json.dumps({
         "map_frame": map_frame,
         "position": map_from_body.translation.tolist(),

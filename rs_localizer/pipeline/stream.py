@@ -26,10 +26,10 @@ _STEP, _ROUNDING = 0.25, 1e-6
 
 
 class Stream:
-    """The order of the frames, and whether their poses can be those of a camera.
+    """The order of the frames, and a check that their poses can be a camera's.
 
     Args:
-        notice: told what is odd.
+        notice: called with oddities.
         forget: called where a frame cannot follow the last one.
     """
 

@@ -39,7 +39,7 @@ class Tags:
 
     Args:
         marker_map: the map; only its single markers count.
-        notice: told of what is odd.
+        notice: called with oddities.
     """
 
     def __init__(self, marker_map: MarkerMap, notice: Notify) -> None:

@@ -1,9 +1,9 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Frames that are refused for how their sender counts pixels or corners: what would fit, is said.
+"""Frames that are refused for a mistake of their sender in pixels or corners.
 
-Each known mistake is undone on the points at hand. If the frame fits then, that is what is wrong,
-and no figure of residuals says it.
+Each known mistake is undone on the points of the frame. If the frame fits then, the mistake is
+found; residuals alone do not show it.
 """
 
 from __future__ import annotations

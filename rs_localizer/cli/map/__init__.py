@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``rs_localizer map``: what a map holds, and maps made from recordings and from other maps."""
+"""``rs_localizer map``: describe maps, and make them from recordings and from other maps."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``rs_localizer map info``: what a map file holds."""
+"""``rs_localizer map info``: describe a map file."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def read(options: Options) -> tuple[Map | MarkerMap, str]:
 
 
 def describe(file: Path, any_map: Map | MarkerMap, kind: str) -> Figures:
-    """Print what a map holds, and return it."""
+    """Print the content of a map, and return it."""
     figures: Figures = {"format": kind}
     if isinstance(any_map, MarkerMap):
         figures |= {"map_frame": any_map.map_frame, "markers": len(any_map.markers)}

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sparse models of COLMAP: cameras, images, points with who sees them, and descriptors.
+"""Sparse models of COLMAP: cameras, images, points with their observations, and descriptors.
 
 They are read by pycolmap (extra ``mapping``), in a process of its own
 (:mod:`rs_localizer.io.maps.colmap_process`). Where there is none (ARM), ``map align`` elsewhere
@@ -127,7 +127,7 @@ def write_model(
         folder: where to.
         camera: of all images, with the number 1.
         images: by their names; each keypoint's point is one of ``points``, or -1.
-        points: with what is said of them.
+        points: with their errors and tracks.
 
     Raises:
         ValueError: for a lens that COLMAP has no name for.

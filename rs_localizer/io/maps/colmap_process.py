@@ -72,8 +72,8 @@ def _camera(number: int, camera: Any) -> str:
 def describe(found: dict[str, Any], database: str) -> dict[str, Any]:
     """Return descriptors (k,d) of the points that have any, and the mask (n,) of these points.
 
-    A landmark's descriptor is the medoid of those of the images that see it: the one nearest to
-    the others.
+    A landmark's descriptor is the medoid of its descriptors in images: the one nearest to the
+    others.
     """
     tracks, starts, per_image = found["tracks"], found["starts"], {}
     with closing(sqlite3.connect(f"{Path(database).resolve().as_uri()}?mode=ro", uri=True)) as file:

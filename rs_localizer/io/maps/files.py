@@ -73,7 +73,7 @@ def _arrays(file: IO[bytes]) -> dict[str, NDArray[Any]]:
 
 
 def write_npz(path: Path, landmarks: Map) -> None:
-    """Write a map; what is read back is the same to the last bit."""
+    """Write a map, which reads back the same to the last bit."""
     arrays = {name: getattr(landmarks, name) for name in _ARRAYS}
     with path.open("wb") as file:  # given a name, NumPy would append a suffix
         np.savez(file, **{name: array for name, array in arrays.items() if array is not None})

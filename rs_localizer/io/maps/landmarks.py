@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A map: landmarks with what they are recognized by."""
+"""A map: landmarks with ids or descriptors, by which they are recognized."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Map:
         frame: in which the points are given.
         dropped: landmarks that were left out because they held NaN or infinity, or because no
             descriptor of theirs is known.
-        covariances: (n,3,3) m^2, NaN for those of which none is known; or None.
+        covariances: (n,3,3) m^2, NaN if unknown; or None.
         error_modes: (n,3,k) float32, m: by how much one standard deviation of each of k independent
             errors moves them all; beside ``covariances``, in which these are not; or None.
 
