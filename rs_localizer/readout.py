@@ -66,7 +66,7 @@ def known_cameras() -> list[Known]:
 def find_readout(name: str, mode: str = "") -> list[Known]:
     """Return all modes whose camera has the words of ``name``, and whose mode those of ``mode``.
 
-    Never one of several: who asks chooses.
+    All matches are returned: the caller chooses.
 
     Raises:
         ValueError: when there is none, with names that are like it.

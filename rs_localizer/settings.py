@@ -253,7 +253,7 @@ def write_camera_file(
     lens: Mapping[str, Any],
     remarks: Sequence[str] = (),
 ) -> None:
-    """Write what is known of a camera or of a rig, for ``--camera`` and ``camera_file``.
+    """Write the calibration of a camera or a rig, for ``--camera`` and ``camera_file``.
 
     Args:
         values: the settings, by dotted name.

@@ -123,7 +123,7 @@ class _Look(NamedTuple):
 
 
 class ShutterWatch:
-    """Compares the shutter that is set with what the frames show; see the module.
+    """Compares the configured shutter with the frames; see the module.
 
     Args:
         camera: as it is set; None: there is nothing to compare.
@@ -171,7 +171,7 @@ class ShutterWatch:
         return _AT_REST if self.is_global else 0.0
 
     def widened(self, found: Estimate) -> Estimate:
-        """Return the last frame with room for what it is as well, if the shutter may be another."""
+        """Return the last frame with a covariance that allows for another shutter."""
         if not (self._reversed or self._across):
             return found
         own = np.r_[found.angular_velocity, found.linear_velocity]
@@ -231,7 +231,7 @@ class ShutterWatch:
         return _Look(time_ns, found, units, rows, off, squeeze)
 
     def _measure(self, before: _Look, now: _Look, after: _Look, seconds: float) -> None:
-        """Take what a frame shows whose neighbours are this many s apart."""
+        """Add the evidence of a frame whose neighbours are this many s apart."""
         assert self._camera is not None
         back = now.found.rotation
         turn = so3.log(np.ascontiguousarray(before.found.rotation @ back.T))
@@ -287,7 +287,7 @@ class ShutterWatch:
         return MeasuredReadout(value, math.sqrt(spread[axis, axis] - gain * spread[axis, other]))
 
     def _far(self, over_rows: float, over_columns: float) -> float:
-        """Return the half the squared distance of a shutter from what is known."""
+        """Return half the squared distance of a shutter from the prior."""
         off = self._mean[:2] - (over_rows, over_columns)
         return 0.5 * float(off @ np.linalg.solve(self._covariance[:2, :2], off))
 

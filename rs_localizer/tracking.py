@@ -216,7 +216,7 @@ class Tracker:
         return self._integrity.stale(points)
 
     def mount(self, rig: Rig) -> None:
-        """Localize with the same cameras where they are now; the rig's axes stay the same."""
+        """Set new mounts of the same cameras; the rig's axes stay the same."""
         self.localizer = Localizer(rig, self.localizer.config)
 
     def _trusts_motion(self, context: FrameContext) -> bool:
@@ -390,10 +390,10 @@ class Tracker:
     ) -> Estimate | Failure:
         """Localize the frame whose middle row was exposed at ``time_ns``.
 
-        Arguments, result and errors otherwise as :meth:`Localizer.localize`. A time that does not
-        follow the last one (a bag that starts over) or a gap of a second ends the track. Pixels
-        that are those of the last image, bit for bit, count once, and are refused where the camera
-        has moved since; :attr:`repeats` tells of them.
+        Arguments, result and errors are otherwise as of :meth:`Localizer.localize`. A time that
+        does not follow the last one (a bag that starts over) or a gap of a second ends the track.
+        Pixels that repeat the last image, bit for bit, count once; if the camera has moved since,
+        they are refused. :attr:`repeats` is then true.
 
         Args:
             imu: samples from before the last frame with a pose, if there are any, until after the
@@ -489,7 +489,8 @@ class Tracker:
     ) -> Estimate | Failure | None:
         """Return the result of a frame that repeats the last image; None if it does not.
 
-        A camera that moved since cannot have seen it. Of one that rests, the image says what it
+        A camera that has moved since cannot have seen it. If the camera rests, the image adds no
+        information: the track stays as it was.
         said before, and no more: the track stays as it was.
         """
         copies = self._images.copies(points, pixels) if self.newest_ns != time_ns else []

@@ -1,9 +1,9 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``ros2 run rs_localizer doctor``: what a localizer finds on a running robot, in one screen.
+"""``ros2 run rs_localizer doctor``: describe in one screen what a localizer finds on a robot.
 
-It looks for the topics, has the node itself localize what comes on them, under names of its own
-and without sending transforms, and prints what the node knows.
+It looks for the topics and runs the node itself on them, under names of its own and without sending
+transforms. It prints what the node finds.
 """
 
 import sys
@@ -112,10 +112,10 @@ class Surroundings:
 
 
 class DoctorNode(LocalizerNode):
-    """A localizer that disturbs nobody, and says what it finds.
+    """A localizer that disturbs nobody and reports what it finds.
 
     Args:
-        around: what is published; the first topic of each input is listened to.
+        around: published topics; the node subscribes to the first topic of each input.
         options: of rclpy's node.
     """
 

@@ -225,7 +225,7 @@ def from_camera(texts: Texts, kind: Kind, values: Mapping[str, Any] | None = Non
 def with_board(texts: Texts) -> dict[str, Any]:
     """Return settings beside a marker detector: the deviation of the boards in its map.
 
-    What was given, or stands in its params file, counts more.
+    Given arguments and settings of its params file take precedence.
     """
     values = given({name: text for name, text in texts.items() if name != "marker_map"})
     with suppress(SettingsError, MarkerMapError):  # the nodes say what is wrong with their files

@@ -96,7 +96,7 @@ def into_rig(models: Array, camera: IntArray, mounts: Mounts) -> None:
 
 @kernel
 def converged(work: Array, change: int) -> bool:
-    """Return True if value ``change``, as of :meth:`Sample.stepped`, is that of no more steps."""
+    """Return True if no lane steps any more, by value ``change`` of :meth:`Sample.stepped`."""
     moving = False
     for lane in range(LANES):
         moving = moving or work[change * LANES + lane] > _CONVERGED**2
@@ -159,7 +159,7 @@ class Sample:
     ) -> Vector:
         """Append steps (rad) and their square to :meth:`with_results` of an iteration.
 
-        A sample that has converged stays what it is, whatever the others in its lanes do.
+        A converged sample stays as it is, whatever the others in its lanes do.
         """
         change = sum((dot(step, step) for step in steps), 0.0)
         before = self.with_results(self.points, self.rotation, self.state)

@@ -18,7 +18,7 @@ from typing import NamedTuple
 class Row(NamedTuple):
     """Where a solver is: a module of this folder and its batch kernels.
 
-    Names and not functions, because who asks what there is does not want to compile it.
+    It holds names instead of functions, so that listing solvers compiles nothing.
     """
 
     module: str

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The readout time of a recording: value, honest deviation, direction, and what is odd about it."""
+"""The readout time of a recording: value, honest deviation, direction, and oddities."""
 
 from __future__ import annotations
 

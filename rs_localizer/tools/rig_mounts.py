@@ -56,7 +56,7 @@ makes 0.1 deg of 1.5 ms, and frames of a pair notice extrinsics that are 0.2 deg
 
 
 class Recording(NamedTuple):
-    """One camera's part: what it was calibrated with, and what came of it."""
+    """One camera's part: its calibration and its recording."""
 
     camera: Camera
     calibration: CameraCalibration
@@ -64,7 +64,7 @@ class Recording(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mounted:
-    """A camera of a rig as the recordings of all say; the axes are those of the first camera."""
+    """A camera of a rig, estimated from all recordings, in the axes of the first camera."""
 
     camera: Camera  # with its lens; the readout time and scan direction it was assumed to have
     readout_time: float  # s; negative: against that direction

@@ -183,7 +183,7 @@ def _deviations(covariances: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedFrame:
-    """A frame with a pose: what the cameras saw, by their names."""
+    """A frame with a pose, and the views of the cameras by their names."""
 
     time_ns: int  # of the pose
     images: Mapping[str, ImagePoints]  # their inliers; stamps are exposures of first rows

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Words on a calibration: what is believed (``readout_belief``), and what its lens is worth."""
+"""Words on a calibration: the accepted readout time, and the quality of the lens."""
 
 from __future__ import annotations
 

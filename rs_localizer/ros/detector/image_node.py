@@ -68,7 +68,7 @@ Settings = TypeVar("Settings", DetectorConfig, FeatureConfig)
 class ImageNode(ManagedNode[Settings, Result], Generic[Settings, Result]):
     """Looks at images; see :class:`rs_localizer.ros.node.managed.ManagedNode`.
 
-    A node says what it looks for by overriding :meth:`make_finder`, :meth:`make_cloud`,
+    A node defines what it looks for by overriding :meth:`make_finder`, :meth:`make_cloud`,
     :meth:`draw` and :meth:`describe`.
     """
 

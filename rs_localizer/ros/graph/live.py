@@ -50,8 +50,8 @@ class LiveNode:
 
     Args:
         settings: its parameters.
-        log: file for what it says.
-        delay_ns: from the stamp of a frame to that of its pose, by these settings.
+        log: file for its log.
+        delay_ns: time from the stamp of a frame to the stamp of its pose, by these settings.
     """
 
     def __init__(self, settings: Mapping[str, Any], log: Path, delay_ns: int) -> None:

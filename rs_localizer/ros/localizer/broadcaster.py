@@ -50,7 +50,7 @@ class Broadcaster:
 
     Args:
         node: sends, and listens for the odometry.
-        refusals: told of what was not sent, and of contradictions.
+        refusals: logs what was not sent, and contradictions.
     """
 
     def __init__(self, node: Node, refusals: Refusals) -> None:
@@ -117,7 +117,7 @@ class Broadcaster:
         )
 
     def _forget_pose(self) -> None:
-        """Hold nothing; the drift is the same odometry's as before."""
+        """Forget the held pose; the drift stays, as odometry is the same."""
         self._state, self._decision = CorrectionState(drift=self._state.drift), None
 
     def fault(self) -> dict[str, str]:
@@ -197,7 +197,7 @@ class Broadcaster:
                         self._say(error)
 
     def _take(self, frame: Localized, config: NodeConfig, last: bool) -> None:
-        """Send what follows of a frame."""
+        """Send the transform that follows from a frame."""
         if config.publish_tf != PublishTf.MAP_TO_ODOM:
             item, _ = broadcast(frame, config, self.tf, self._state)
             if item is not None:
@@ -306,7 +306,7 @@ class Broadcaster:
             self._refusals.notice(Notice.NOT_BROADCAST, f"saved_pose_file: {error}")
 
     def _hold(self, config: NodeConfig) -> None:
-        """Send what is held ahead of the newest odometry, if that is new."""
+        """Send the held transform, stamped ahead of the newest odometry, if that is new."""
         if self._state.held is None:
             return
         newest_ns, odom = self.tf.latest(config.odom_frame, self._body)

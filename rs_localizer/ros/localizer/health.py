@@ -179,9 +179,9 @@ def _of_frames(silence: Mapping[str, Silence]) -> list[Silence]:
 def diagnose(condition: Condition, summary: Summary) -> Health:
     """Judge the node.
 
-    The states are ``inactive``, ``waiting for`` what is missing or for frames, ``busy``, ``lost``,
-    ``localized`` (by a search) and ``tracking``. What is odd is a warning where nothing worse is to
-    be said.
+    The states are ``inactive``, ``waiting for`` something missing or frames, ``busy``, ``lost``,
+    ``localized`` (by a search) and ``tracking``. An oddity is a warning if there is nothing worse
+    to report.
     """
     return _judge(condition, summary).with_values(_values(condition, summary))
 

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node ``rs_localizer``: correspondences and camera_info in; pose, twist and inliers out.
 
-From message to pose: ``Inputs`` takes a message, ``_take_frame`` leaves it to the ``Worker``, which
-keeps the newest; ``FrameLocalizer`` localizes it, and ``Publisher`` publishes what comes of it.
+From message to pose: ``Inputs`` takes a message, ``_take_frame`` passes it to the ``Worker``, which
+    keeps the newest one. ``FrameLocalizer`` localizes it, and ``Publisher`` publishes the result.
 """
 
 import functools

@@ -57,7 +57,7 @@ class Rivals:
 
         Args:
             message: it.
-            decision: on ``map -> odom``, if that is what is sent.
+            decision: decision on ``map -> odom``, if the node sends it.
             static: whether it is on ``/tf_static``.
         """
         with self._lock:

@@ -112,7 +112,7 @@ class Tf:
             buffer.clear()
 
     def close(self) -> None:
-        """Stop listening; whoever asks for a transform gets none."""
+        """Stop listening; later lookups find nothing."""
         self._buffer = None
         self._undo.close()
 

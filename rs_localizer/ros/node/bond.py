@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The heartbeat by which nav2's lifecycle manager sees that a node it has activated lives.
 
-The manager listens on ``bond`` for a status with the node's name, at least once in its
-``bond_timeout`` (4 s); it stops the robot where none comes. The messages are those of the package
-``bond``, which comes with nav2 and is not on PyPI: it is imported when a node is activated.
+The manager expects a status with the node's name on ``bond``, at least once in its ``bond_timeout``
+(4 s), and otherwise stops the robot. The messages come from the package ``bond``, which comes with
+nav2 and is not on PyPI. So it is imported when a node is activated.
 """
 
 import uuid

@@ -123,7 +123,7 @@ class Diagnostics:
         node: publishes it.
         examine: the health, and the camera's frame (the hardware_id; empty if unknown).
         notice: told of a state that lasts and is not right, by its name and one sentence.
-        task: what the node does.
+        task: name of the node's task.
         lack: name of the notice.
     """
 

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A managed node with a worker: what the nodes of this package have in common.
+"""A managed node with a worker, the base of all nodes of this package.
 
 Two threads: the executor's takes messages, answers services, changes parameters and the life cycle,
 and publishes diagnostics; the worker's does the work and publishes its results.
@@ -41,13 +41,13 @@ Result = TypeVar("Result")
 class ManagedNode(parameters.Started, LifecycleNode, Generic[Config, Result]):
     """Only while active it takes and publishes messages.
 
-    A node says what it does by overriding :meth:`check`, :meth:`open`, :meth:`close`,
-    :meth:`begin`, :meth:`end`, :meth:`change` and :meth:`examine`.
+    A node defines its work by overriding :meth:`check`, :meth:`open`, :meth:`close`, :meth:`begin`,
+    :meth:`end`, :meth:`change` and :meth:`examine`.
 
     Args:
         name: of the node.
         kind: class of its settings, which become its parameters.
-        tell: stamp (ns) and what the statistics keep of a result.
+        tell: returns the stamp (ns) and the statistics of a result.
         options: of rclpy's node.
 
     Raises:
@@ -121,7 +121,7 @@ class ManagedNode(parameters.Started, LifecycleNode, Generic[Config, Result]):
         raise NotImplementedError
 
     def end(self) -> None:
-        """Undo :meth:`begin` likewise, but for what it listens to."""
+        """Undo :meth:`begin`, except for the subscriptions."""
         raise NotImplementedError
 
     def change(self, config: Config) -> None:
@@ -151,7 +151,7 @@ class ManagedNode(parameters.Started, LifecycleNode, Generic[Config, Result]):
         publish: Callable[[Result], None],
         patience: Callable[[Any], float] = lambda _: 0.0,
     ) -> Worker[Result]:
-        """Start the worker, which alone touches what it works with from now on."""
+        """Start the worker; from now on only the worker uses what it works with."""
         failed = functools.partial(self.refusals.add, "internal_error")
         self.worker = Worker(work, publish, self.statistics, failed, patience)
         return self.worker

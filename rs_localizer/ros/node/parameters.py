@@ -36,8 +36,8 @@ _UNCONFIGURED = "unconfigured"
 class Started(Node):
     """A node that knows the values that it was started with.
 
-    rclpy has them declared all at once, without descriptions and for good, and offers no other way
-    to learn their names. Here they are kept and declared as what they are.
+    rclpy declares them all at once, without descriptions and for good, and offers no other way to
+    learn their names. Here they are kept, and declared with their types and descriptions.
     """
 
     given: Mapping[str, Any] = MappingProxyType({})

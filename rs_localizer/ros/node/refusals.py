@@ -28,8 +28,8 @@ class _Logged:
 class Refusals:
     """Counts refusals and passes on one text per kind and period.
 
-    Of one kind are those of the same reason whose details differ in their numbers only. All methods
-    may be called from any thread.
+    Refusals of one reason whose details differ only in numbers are of one kind. All methods may be
+    called from any thread.
 
     Args:
         log: takes a line of text.
@@ -53,7 +53,7 @@ class Refusals:
         self.notice(reason, detail)
 
     def notice(self, reason: str, detail: str) -> None:
-        """Log likewise what is no refusal."""
+        """Log an oddity that is no refusal in the same way."""
         with self._lock:
             self._latest[reason] = self._clock(), detail
             line = self._line(reason, detail)

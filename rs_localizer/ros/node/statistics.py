@@ -100,7 +100,7 @@ class Statistics(Generic[Result]):
     """Counts frames; all methods may be called from any thread.
 
     Args:
-        refusals: logs and counts what is refused.
+        refusals: logs and counts refusals.
         tell: stamp of the frame (ns) and what is told of a result.
         ros_time: now in ns, by the clock of the stamps.
         clock: s, monotonic.

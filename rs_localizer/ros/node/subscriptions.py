@@ -41,10 +41,10 @@ def node_of(publisher: Any) -> str:
 def best(wished: Policies, offers: Sequence[Policies]) -> Policies:
     """Return the wished policies; for ``BEST_AVAILABLE`` the most that all publishers offer.
 
-    A subscription that asks for more than a publisher offers hears nothing; one that asks for less
-    loses what is large (of reliable clouds of 2 MB a best-effort subscription of Fast DDS heard 3
-    of 60) and misses what was latched. The middleware's own ``BEST_AVAILABLE`` looks at publishers
-    only when a subscription is made.
+    If a subscription asks for more than a publisher offers, it gets nothing. If it asks for less,
+    it loses large messages (of reliable clouds of 2 MB a best-effort subscription of Fast DDS got 3
+    of 60) and misses latched ones. The middleware's own ``BEST_AVAILABLE`` looks at publishers only
+    when a subscription is made.
     """
     reliability, durability = wished
     if reliability == ReliabilityPolicy.BEST_AVAILABLE:

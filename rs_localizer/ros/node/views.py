@@ -27,7 +27,7 @@ _DEPTH = 0.3  # m, of the drawn view of the camera
 
 
 class MapView:
-    """Publishes a map on ``~/map_markers``, for whoever comes late, too.
+    """Publishes a map on ``~/map_markers``, also for late subscribers.
 
     Args:
         node: creates the publisher.

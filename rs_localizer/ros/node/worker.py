@@ -57,7 +57,8 @@ class Worker(Generic[Result]):
         statistics: told what becomes of each frame.
         failed: told in one sentence of errors in updates that nobody foresaw; the thread goes on.
             Those in frames are refusals, ``internal_error``.
-        patience: s for which a frame waits, since it came, for what it lacks now; 0: for nothing.
+        patience: time (s) that a frame waits, since its arrival, for what it lacks; 0: it does not
+            wait.
     """
 
     def __init__(
@@ -85,8 +86,8 @@ class Worker(Generic[Result]):
     def update(self, kind: str, update: Callable[[], None]) -> None:
         """Queue this before the next frame, after all updates of other kinds so far.
 
-        An older one of the same kind that still waits is dropped: an update says how things are
-        now, not what has changed.
+        An older update of the same kind that still waits is dropped: an update describes the
+        present state, not a change.
         """
         with self._changed:
             self._updates.pop(kind, None)
@@ -189,7 +190,7 @@ class Worker(Generic[Result]):
             yield each
 
     def _finish_late(self) -> None:
-        """Publish what has become known, in the order in which it came; give up what is overdue."""
+        """Publish results that are ready, in the order of their arrival; give up overdue ones."""
         while self._late:
             frame, waiting, deadline = self._late[0]
             result = self._attempt(waiting.again)

@@ -48,7 +48,8 @@ def cluster_robust(problem: Problem, fitted: Fit) -> Fit:
     """Return the estimate with covariances as large as its own errors show.
 
     Args:
-        problem: whose minimum it is, with the same freedom and without delays of images.
+        problem: the problem whose minimum is given, with the same freedom and without delays of
+            images.
     """
     of_errors = steepness(fitted.squared_errors[fitted.inliers], fitted.deviation) ** 2
     pull = _pull(problem, fitted)
@@ -121,7 +122,7 @@ def pull_at_landmarks(rows: Array, landmarks: IntArray, times: Array, held: Arra
         rows: (n,2,4) whitened derivatives by the landmark, and the error.
         landmarks: (n,) numbers of the landmarks.
         times: (n,) s.
-        held: (p,) 1/m^2, of what is known of the landmarks beforehand.
+        held: (p,) 1/m^2, prior information on the landmarks.
     """
     seconds = np.floor(times / SECONDS)
     order = np.lexsort((seconds, landmarks))

@@ -28,7 +28,7 @@ _COST_PER_PARAMETER = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """An estimate with what is known of its errors."""
+    """An estimate with the covariance of its errors."""
 
     state: Unknowns
     camera: Camera
@@ -68,7 +68,7 @@ def fit(
         camera: lens model, size and scan direction; its readout time and numbers do not matter.
         observations: all keypoints; those not trusted take part once the motion is about right.
         start: first guess; its knots stay.
-        freedom: what is estimated.
+        freedom: the unknowns.
         deviation: px, of the noise about the first guess if that is good; otherwise the trusted
             keypoints have to lead to it.
 

@@ -50,7 +50,7 @@ class Problem:
         views: of the cameras, of which the first has what is expected of the motion.
         start: first guess.
         noises: (k,) px, of each camera's keypoints; they keep their ratios (None: all alike).
-        one_map: the free landmarks are the same of all; they come last in the border, once.
+        one_map: the free landmarks are common to all views; they come last in the border, once.
         deviations: (p,) m, of landmarks that are all free and the same of all, and eliminated,
             about where they are observed to be; None: what the views' freedom says.
         floating: nothing holds the whole but its start.
@@ -236,7 +236,7 @@ class Problem:
         return max(noise_of(self.errors(state), deviation), self.freedom.least_noise)
 
     def of_views(self, views: Sequence[CameraView], start: Unknowns) -> Problem:
-        """Return the same of other views of the cameras."""
+        """Return the problem with other views of the cameras."""
         floating = self.floating is not None
         return Problem(views, start, self.noises, self._one_map, self.deviations, floating)
 

@@ -28,7 +28,7 @@ _LEAST_PACE = 0.1
 
 
 class Curve(NamedTuple):
-    """A spline and what is computed of it once per step."""
+    """A spline and the products that are computed once per step."""
 
     rotations: Array3  # (n,3,3)
     positions: Array2  # (n,3)

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Normal equations of whitened rows, their solution, and what is known then.
+"""Normal equations of whitened rows, their solution, and its covariance.
 
 Unknowns stand in three groups: ``motion``, the controls of a spline, of which a row touches a run
 of neighbours; a dense ``border`` that many rows share; and blocks of ``width`` numbers that no row
@@ -110,7 +110,7 @@ class System:
 
     Args:
         groups: the unknowns.
-        terms: rows, and what is known of the border.
+        terms: rows, and priors of the border.
     """
 
     def __init__(self, groups: Groups, terms: Sequence[Rows | Quadratic]) -> None:

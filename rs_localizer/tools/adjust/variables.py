@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements, what is free, and the unknowns with their steps."""
+"""Measurements, free unknowns, and their steps."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class GyroMount:
     """How a gyroscope measures.
 
     It measures ``(1 + shape) camera_from_imu^T rate + bias`` of the camera's rate at ``t + delay``.
-    The symmetric ``shape`` has what a consumer's gyroscope is wrong in: the scales of its axes and
-    the angles between them, a percent or so. Without it the readout time would pay for them.
+    The symmetric ``shape`` has the errors of a consumer gyroscope: the scales of its axes and the
+    angles between them, a percent or so. Without it the readout time would absorb them.
     """
 
     camera_from_imu: Array  # (3,3)
@@ -135,7 +135,7 @@ class MountPrior:
 
 @dataclass(frozen=True, slots=True)
 class Freedom:
-    """Unknowns beside the motion, and what is known of them."""
+    """Unknowns beside the motion, and their priors."""
 
     readout_time: bool = True
     lens: bool = False

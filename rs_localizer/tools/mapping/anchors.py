@@ -101,12 +101,12 @@ def placement(
     """Return the frame of the map in metres.
 
     Args:
-        anchors: what is known.
+        anchors: known points, distances and markers.
         triangulated: where they are in the map.
         rotations, positions: (g,3,3), (g,3) map_from_camera of all views, as they were held.
 
     Raises:
-        MappingError: when what is known contradicts itself or was not seen.
+        MappingError: if the anchors contradict each other or were not seen.
     """
     if anchors.marker_map is not None:
         return _by_markers(anchors.marker_map, triangulated)
@@ -187,7 +187,7 @@ def _by_markers(marker_map: MarkerMap, triangulated: Triangulated) -> Placement:
 def _down(rotations: Array) -> Array:
     """Return the direction most often at right angles to image rows: cameras are held level.
 
-    Its sign is that of the images' mean downward direction.
+    Its sign is given by the mean downward direction of the images.
     """
     across = rotations[:, :, 0]
     _, vectors = np.linalg.eigh(across.T @ across)

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Gauge of a map: similarities, and what is known when nothing outside of it says where it is.
+"""Gauge of a map: similarities, and covariances of a map that nothing outside of it holds.
 
 While map and motion are adjusted the camera's positions and orientations hold them, on average,
 where they were. The result is then laid over the map as it was given, by the similarity that fits

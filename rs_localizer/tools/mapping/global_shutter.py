@@ -62,7 +62,7 @@ def undo_shutter(
 
     Args:
         camera: of all images; its shutter does not matter.
-        model: points and who sees them.
+        model: points and the images that see them.
         stamps_ns: of the images, by their names; no two are the same.
         shutter: readout time, s, None: estimated; and scan direction, None: unknown.
         lens: whether the lens is adjusted.

@@ -156,7 +156,7 @@ class Start:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapFreedom:
-    """Unknowns beside landmarks and motion, and what is known of them."""
+    """Unknowns beside landmarks and motion, and their priors."""
 
     readout_time: bool = False
     lens: bool = False

@@ -350,7 +350,7 @@ _WORTH = 1.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinedMap:
-    """Landmarks and motion, with what is known of their errors."""
+    """Landmarks and motion, with the covariance of their errors."""
 
     points: Array  # (p,3) m
     covariances: Array  # (p,3,3) m^2; NaN where not refined
@@ -443,7 +443,7 @@ def refine_rig(
         seen: keypoints of landmarks; those of landmarks that one image alone sees do not count.
         start: first guess; without landmarks of known places the map as a whole, its size too,
             stays where this has it.
-        freedom: what is estimated beside (default: landmarks and motion only).
+        freedom: further unknowns (default: landmarks and motion only).
         done: called with each part of the work that is done.
 
     Raises:

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The images that a map is made from: what is kept of each when its pixels have been let go."""
+"""The images that a map is made from, as far as they are kept without their pixels."""
 
 from __future__ import annotations
 

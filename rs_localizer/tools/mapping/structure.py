@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The first structure of a scene, by COLMAP: where keyframes were, what they show, and the lens.
+"""The first structure of a scene, by COLMAP: poses of keyframes, their observations, and the lens.
 
 Extraction, matching, incremental mapping and self-calibration are COLMAP's with its defaults
 (J. L. Schoenberger, J.-M. Frahm, Structure-from-Motion Revisited, CVPR 2016), in a process of its

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Places of markers, from recordings that show them, by one camera or by those of a rig.
+"""Poses of markers, from recordings that show them, by one camera or by the cameras of a rig.
 
 Continuous-time adjustment with the poses of the markers free, each a rigid square of known size.
 The first marker is the origin; whatever shows several of them closes loops.
@@ -215,7 +215,7 @@ _MOST_TURNS = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Survey:
-    """Markers and what is known of their errors."""
+    """Markers and the covariance of their errors."""
 
     markers: tuple[Marker, ...]  # in the frame of the first of them, the origin
     # (6 m, 6 m) of place (m) and turn (rad) along the map's axes: in the frame of the origin,
@@ -395,8 +395,7 @@ def _right_side_up(given: Adjustable, fitted: Fit) -> tuple[Fit, BoolArray]:
 def _less_noise(given: Adjustable, fitted: Fit) -> Fit:
     """Fit again with corners that are better than was assumed.
 
-    Weighed too little, they lose to what is known of accelerations beforehand, and the readout time
-    with them.
+    If they weigh too little, the prior of the accelerations wins, and the readout time suffers.
     """
     noise = fitted.deviation * math.sqrt(fitted.inflation)
     if fitted.deviation > _LEAST_NOISE or noise > _LEAST_NOISE:

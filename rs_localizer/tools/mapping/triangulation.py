@@ -100,7 +100,7 @@ def moves(
     To first order, with the weights that they have.
 
     Args:
-        camera, sights: what the points are triangulated from.
+        camera, sights: the input of the triangulation.
         others: (k) lenses and poses that are hardly different.
     """
     points, count = triangulated.points, len(triangulated.points)

@@ -32,7 +32,7 @@ _CHUNK = 4096
 
 @dataclass(frozen=True, slots=True)
 class ImuSettings:
-    """How good an IMU is: that of a phone or a drone."""
+    """Errors of an IMU, by default of a phone or a drone."""
 
     rate: float = 400.0  # Hz
     gyroscope_noise: float = math.radians(0.01)  # rad/s/sqrt(Hz)

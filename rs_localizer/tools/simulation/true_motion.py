@@ -62,7 +62,7 @@ def sampled_states(motion: TrueMotion, spacing: float = 0.1) -> TrueState:
 class ConstantVelocity:
     """A camera that turns at a constant body rate while its centre moves on a straight line.
 
-    At the start it looks along the map's x axis with z up, from the origin, unless it is said.
+    By default it starts at the origin, looks along the map's x axis, and z is up.
     """
 
     angular_velocity: Array  # (3,) rad/s in camera axes
