@@ -41,7 +41,7 @@ FILE = Path("rs_localizer_doctor.yaml")
 
 
 def input_of(fields: Collection[str]) -> str | None:
-    """The input that a cloud with these fields is for; None: it is for none."""
+    """Return the input that a cloud with these fields is for; None if there is none."""
     names = set(fields)
     if "residual" in names:  # a localizer's own inliers
         return None
@@ -55,7 +55,7 @@ def input_of(fields: Collection[str]) -> str | None:
 
 
 class Surroundings:
-    """What is published: topics by the input that they are for, and the sizes of images.
+    """Published topics by the input that they are for, and the sizes of images.
 
     Args:
         node: listens, while :meth:`until` runs.
@@ -129,7 +129,7 @@ class DoctorNode(LocalizerNode):
         self.get_logger().set_level(LoggingSeverity.FATAL)  # all is in the report
 
     def report(self) -> Iterator[str]:
-        """Lines on what it finds; the last one is the answer."""
+        """Yield lines on what was found; the last one is the answer."""
         health, frame = self.examine()
         values = health.values
         if topics.CAMERA_INFO not in self._around.inputs:
@@ -178,7 +178,7 @@ def _line(*words: str) -> str:
 
 
 def answer(health: Health) -> str:
-    """The state and how well the pose is known, and what is wrong."""
+    """Return the state, how well the pose is known, and what is wrong."""
     words = [] if health.level == Level.OK else [health.message]
     if health.state in (State.TRACKING, State.LOCALIZED):
         words.insert(0, f"{health.state}, {health.values[DEVIATION]} cm")
@@ -186,7 +186,7 @@ def answer(health: Health) -> str:
 
 
 def launch_words(inputs: Mapping[str, list[str]]) -> str:
-    """The command that starts a localizer on these topics."""
+    """Return the command that starts a localizer on these topics."""
     words = [f"{name}:={found[0]}" for name, found in inputs.items()]
     words.append(f"params_file:={FILE}")
     return " ".join(["ros2 launch rs_localizer localizer.launch.py", *words])
