@@ -491,7 +491,6 @@ class Tracker:
 
         A camera that has moved since cannot have seen it. If the camera rests, the image adds no
         information: the track stays as it was.
-        said before, and no more: the track stays as it was.
         """
         copies = self._images.copies(points, pixels) if self.newest_ns != time_ns else []
         self.repeats, track = bool(copies), self._track

@@ -5,7 +5,6 @@
 A raw pixel is a pixel of the driver's image: distorted, with the centre of the first pixel at (0,
 0), possibly binned and cropped. Its bearing comes from the undistorted position, its row time from
 the raw row of the full sensor: distortion moves light between rows, not rows in time.
-the raw row of the full sensor: distortion moves light between rows, not rows in time.
 """
 
 from __future__ import annotations

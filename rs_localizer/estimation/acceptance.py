@@ -40,7 +40,7 @@ def refusal(
     threshold: float,
     rolling: bool,
 ) -> Failure | None:
-    """Reason to refuse an estimate, or None.
+    """Return the reason to refuse an estimate, or None.
 
     Args:
         posterior: ``declared`` is all that map and calibration are known to be off.
@@ -98,20 +98,20 @@ def refusal(
 
 
 def noise_fills(posterior: Posterior, rolling: bool) -> bool:
-    """Whether errors are as large as the gate lets them be, so that nobody knows their noise."""
+    """Return whether errors are as large as the gate allows, so that the noise is unknown."""
     most = _MOST_NOISE if rolling else _MOST_NOISE_GLOBAL_SHUTTER
     return posterior.noise > most * posterior.gate
 
 
 def speeding(observed: Observed, state: Array) -> float:
-    """Squared velocities, in standard deviations of what the configuration expects of them."""
+    """Return the squared velocities, in standard deviations that the configuration expects."""
     part = VELOCITIES if observed.sighted.turn is None else LINEAR  # of the rest a gyroscope knows
     velocities = state[POSE_SIZE - POSE.stop :][part]
     return float(velocities @ observed.terms.informations[0][part, part] @ velocities)
 
 
 def uncertain(estimate: Estimate, most: float) -> Failure | None:
-    """Reason for which an estimate is too uncertain to be published, or None.
+    """Return why an estimate is too uncertain to be published, or None.
 
     What points do not tell because the camera may move, its covariance says: a global-shutter
     estimator, which takes the camera for one at rest, would publish that pose.

@@ -54,7 +54,7 @@ class Mixture(NamedTuple):
     covariances: Array  # (k,18,18) of the offsets
 
     def along_arcs(self) -> Array:
-        """The covariance (18,18) of steps, of second order (:func:`along_arcs`)."""
+        """Return the covariance (18,18) of steps, of second order (:func:`along_arcs`)."""
         covariance, centre = (
             self.covariance[:PARAMETERS, :PARAMETERS],
             self.state[STATE_TRANSLATION],
@@ -67,7 +67,7 @@ class Mixture(NamedTuple):
 
 @entry
 def moments(means: Array2, covariances: Array3, weights: Array1) -> Array:
-    """Second moments (p,p) of Gaussians (k,p), (k,p,p) about zero, by their weights (k,)."""
+    """Return second moments (p,p) about zero of Gaussians (k,p), (k,p,p) with weights (k,)."""
     size = means.shape[1]
     total = np.zeros((size, size))
     for k in range(len(weights)):
@@ -80,15 +80,15 @@ def moments(means: Array2, covariances: Array3, weights: Array1) -> Array:
 
 
 def weights_of(logarithms: Array) -> Array:
-    """Probabilities (k,) of which these are the logarithms but for a constant."""
+    """Return the probabilities (k,) with these logarithms, up to a constant."""
     weights = np.exp(logarithms - logarithms.max())
     found: Array = weights / weights.sum()
     return found
 
 
 def mixture(parts: Gaussians, preferences: Array, temper: float) -> Mixture:
-    """The mixture of Gaussians: mean by their probabilities, second moments about it by those to
-    the power of ``temper``.
+    """Return the mixture of Gaussians, with the mean by their probabilities, second moments
+    about it by probabilities to the power of ``temper``.
 
     Args:
         preferences: (k,) logarithms of odds that count in the mean alone.
@@ -130,7 +130,7 @@ def mixture(parts: Gaussians, preferences: Array, temper: float) -> Mixture:
 
 @entry
 def _offsets_between(reference: Array1, states: Array2, pivot: Array1) -> tuple[Array, Array]:
-    """:func:`offset_between` of states (k,24): offsets (k,18), derivatives (k,6,3)."""
+    """Return :func:`offset_between` of states (k,24): offsets (k,18), derivatives (k,6,3)."""
     count = len(states)
     offsets, by_turns = np.empty((count, PARAMETERS)), np.empty((count, 6, 3))
     for k in range(count):
@@ -139,7 +139,7 @@ def _offsets_between(reference: Array1, states: Array2, pivot: Array1) -> tuple[
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """As ``np.cross`` of vectors (3,), for a tenth of the time."""
+    """Return ``np.cross`` of vectors (3,), in a tenth of the time."""
     return np.array([
         a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0],
     ])  # fmt: skip
@@ -149,13 +149,14 @@ def _cross(a: Array, b: Array) -> Array:
 def along_arcs(
     covariance: Array2, centre: Array1, weights: Array1, offsets: Array2, covariances: Array3
 ) -> Array:
-    """The covariance with the second order of the move; that of the turn has none.
+    """Return the covariance to second order in the move; the rotation has no second order.
 
-    A mixture's is not that of one Gaussian: who turned by three deviations moved nine times as far
-    off the tangent as who turned by one. The mean stays where the points fit best, so that the mean
-    of the second order counts, too: for ``s_i = y^T H_i y`` of Gaussians ``y`` with mean ``m`` and
-    covariance ``C``, ``E[s_i] = tr(H_i C) + m^T H_i m``, ``E[s_i s_j]`` is ``E[s_i] E[s_j] +
-    2 tr(H_i C H_j C) + 4 m^T H_i C H_j m``, and ``E[y s_i] = m E[s_i] + 2 C H_i m``.
+    The second order of a mixture is not that of one Gaussian: a hypothesis that rotated by three
+    deviations moved nine times as far off the tangent as one that rotated by one. The mean stays
+    where the points fit best, so that the mean of the second order counts, too. Let ``s_i = y^T H_i
+    y`` for Gaussians ``y`` with mean ``m`` and covariance ``C``. Then ``E[s_i]`` is ``tr(H_i C) +
+    m^T H_i m``, and ``E[y s_i]`` is ``m E[s_i] + 2 C H_i m``. The mean of ``s_i s_j`` is ``E[s_i]
+    E[s_j] + 2 tr(H_i C H_j C) + 4 m^T H_i C H_j m``.
 
     Args:
         covariance: (18,18), of a step.
@@ -203,7 +204,7 @@ def along_arcs(
 
 @kernel
 def _times(left: Array2, right: Array2) -> Array:
-    """The product ``left right^T`` of matrices so small that a loop is the fastest."""
+    """Return the product ``left right^T`` of matrices so small that a loop is the fastest."""
     product = np.empty((len(left), len(right)))
     for i in range(len(left)):
         for j in range(len(right)):

@@ -101,7 +101,7 @@ _FEWEST, _FEWEST_TURNING = 6, 8
 
 
 class MotionHypothesis(NamedTuple):
-    """What a camera may be doing."""
+    """A motion that a camera may have."""
 
     name: str
     speed: float  # part of the configured one
@@ -138,7 +138,7 @@ def frame_posterior(
     observations: Observations, start: Array, terms: PriorTerms, threshold: float, assumed: Assumed,
     one_lens: bool = True,
 ) -> Posterior:  # fmt: skip
-    """Posterior of the motion by the points, near a first motion.
+    """Return the posterior of the motion given the points, near a first motion.
 
     Args:
         observations: the points; of very many a part is enough, evenly taken.
@@ -193,7 +193,7 @@ def _given(
     observations: Observations, best: Posterior, terms: PriorTerms, threshold: float,
     assumed: Assumed, one_lens: bool,
 ) -> _Given:  # fmt: skip
-    """What does not depend on the hypothesis."""
+    """Compute everything that does not depend on the hypothesis."""
     data, points, count = observations.packed, observations.points, observations.count
     found = int(np.count_nonzero(best.inliers))
     depth = max(observations.median_depth(best.state, best.inliers), NEAREST)
@@ -220,9 +220,7 @@ def _given(
 
 
 def speeds_of(terms: PriorTerms, assumed: Assumed, is_clear: bool) -> list[MotionHypothesis]:
-    """The typical speeds of a camera, the slowest first; the configured one alone, if that it moves
-    is clear or known.
-    """
+    """Return typical speeds of a camera, slowest first; if motion is clear, the configured one."""
     turn = assumed.turn
     return [
         MotionHypothesis(
@@ -240,7 +238,7 @@ def speeds_of(terms: PriorTerms, assumed: Assumed, is_clear: bool) -> list[Motio
 def _modes(
     frame: Frame, hypotheses: list[MotionHypothesis], start: Array, planar: bool
 ) -> list[tuple[MotionHypothesis, Mode]]:
-    """The Gaussian of each hypothesis of a steady camera, as far as they are probable."""
+    """Return the Gaussians of the hypotheses of a steady camera, as far as they are probable."""
     modes, best, near = [], -math.inf, start
     if len(hypotheses) > 1:
         near = np.concatenate([start[:POSE_SIZE], np.zeros(len(start) - POSE_SIZE)])
@@ -259,7 +257,7 @@ def _modes(
 
 
 def _steady(given: _Given, modes: list[tuple[MotionHypothesis, Mode]]) -> _Camera:
-    """Cameras that do not turn within their frame."""
+    """Return the hypotheses of cameras without in-frame rotation."""
     parts = Gaussians(
         np.array([mode.state for _, mode in modes]), np.zeros((len(modes), 0)),
         np.array([mode.covariance for _, mode in modes]),
@@ -280,15 +278,13 @@ def _steady(given: _Given, modes: list[tuple[MotionHypothesis, Mode]]) -> _Camer
 
 
 def _of_outliers(given: _Given, inliers: BoolArray) -> float:
-    """What the evidence loses by the others, which are anywhere in an image of a focal length
-    squared.
-    """
+    """Return the log evidence of the other points, anywhere in an image of squared focal length."""
     outside = given.observations.count - np.count_nonzero(inliers)
     return 2.0 * outside * math.log(given.assumed.focal_length)
 
 
 def _with_turn(given: _Given, hypotheses: list[MotionHypothesis], steady: _Camera) -> list[_Camera]:
-    """Cameras that do not turn within their frame and, if there may be such, those that do."""
+    """Return hypotheses without in-frame rotation, and with it if it is possible."""
     wide, vibrating = given.best.near_outliers > 0, None
     gain, undetected = _hidden(given, steady.posterior)
     if wide or gain > _ASKS:
@@ -305,7 +301,7 @@ def _with_turn(given: _Given, hypotheses: list[MotionHypothesis], steady: _Camer
 
 
 def _hidden(given: _Given, steady: Posterior) -> tuple[float, Array]:
-    """Evidence and effect of vibration at the best motion without it.
+    """Return evidence and effect of vibration at the best motion without it.
 
     Returns:
         logarithm of its evidence, against none; (12,12) second moments of the motion by it.
@@ -331,7 +327,7 @@ def _hidden(given: _Given, steady: Posterior) -> tuple[float, Array]:
 
 
 def _with_middle(covariance: Array) -> Array:
-    """Covariance (72,72) of the motion with its vibration, from one without it."""
+    """Return the covariance (72,72) of the motion with its vibration, from one without it."""
     covariance = covariance.copy()
     covariance[:PARAMETERS] += MIDDLE @ covariance[PARAMETERS:]
     covariance[:, :PARAMETERS] += covariance[:, PARAMETERS:] @ MIDDLE.T
@@ -349,7 +345,7 @@ class _Turning(NamedTuple):
 
 
 def _at(given: _Given, state: Array, turn: Array, gate: float) -> _Turning:
-    """The points at a motion with an in-frame turn, those within a gate (px) as inliers."""
+    """Return the points at a motion with in-frame rotation; inliers lie within a gate (px)."""
     observations = given.observations
     data, count = observations.packed, observations.count
     shake = shake_at(observations.tau, COMBINATIONS @ turn.reshape(RESOLVED, 3))
@@ -362,7 +358,7 @@ def _at(given: _Given, state: Array, turn: Array, gate: float) -> _Turning:
 def _vibrating(
     given: _Given, hypotheses: list[MotionHypothesis], steady: Posterior
 ) -> _Camera | None:
-    """Cameras that turn within their frame, if such a fit converges to as many points."""
+    """Return hypotheses with in-frame rotation, if such a fit converges to as many points."""
     best, threshold, wide = given.best, given.threshold, given.best.near_outliers > 0
     widest = WIDEST_GATE * threshold
     gate, noise = min(max(threshold, GATE * best.noise), widest), best.noise
@@ -439,7 +435,7 @@ def _after(now: _Turning, step: Array) -> tuple[Array, Array]:
 
 
 def _mixed(given: _Given, groups: list[_Camera]) -> Posterior:
-    """The mixture of all hypotheses, with what the most probable kind leaves of the points."""
+    """Mix all hypotheses; the inliers are those of the most probable kind."""
     if len(groups) > 1:
         evidences = np.concatenate([one.parts.evidences for one in groups])
         preferences = np.concatenate([one.preferences for one in groups])
@@ -467,7 +463,7 @@ def _mixed(given: _Given, groups: list[_Camera]) -> Posterior:
 
 
 def _together(steady: Gaussians, vibrating: Gaussians) -> Gaussians:
-    """Gaussians of both kinds, the ones without an in-frame turn as such of none."""
+    """Join Gaussians of both kinds; those without in-frame rotation have zeros for it."""
     count = len(steady.states)
     covariances = np.zeros((count, PARAMETERS + TURNS, PARAMETERS + TURNS))
     covariances[:, :PARAMETERS, :PARAMETERS] = steady.covariances
@@ -476,7 +472,7 @@ def _together(steady: Gaussians, vibrating: Gaussians) -> Gaussians:
 
 
 def _in_functions(covariance: Array) -> Array:
-    """Covariance (102,102) of motion and all functions' coefficients, from one of (72,72)."""
+    """Return the covariance (102,102) of motion and all coefficients, from one of (72,72)."""
     half, size = covariance[:, PARAMETERS:].reshape(-1, RESOLVED, 3), PARAMETERS + TURNS
     half = np.hstack([covariance[:, :PARAMETERS], (COMBINATIONS @ half).reshape(size, -1)])
     turned = (COMBINATIONS @ half[PARAMETERS:].reshape(RESOLVED, -1)).reshape(-1, half.shape[1])
@@ -487,8 +483,7 @@ def _in_functions(covariance: Array) -> Array:
 def near_outliers(
     lines: Lines, squared_errors: Array1, inliers: BoolArray1, threshold: float
 ) -> int:
-    """Points just beyond the gate, where they are too many to be chance and it is the row that
-    moves them; else 0.
+    """Count points just beyond the gate, if too many for chance and moved by their rows; else 0.
 
     A part of the points that is shifted alike is another group of points, whatever its rows.
     """
@@ -503,7 +498,7 @@ def near_outliers(
 
 @kernel
 def _go_with_rows(lines: Lines, chosen: BoolArray1) -> float:
-    """How much less the errors of neighbouring rows differ than those of any two rows, standard
+    """Return how much less errors of neighbouring rows differ than those of any two rows: standard
     normal if the row does not matter (von Neumann 1941).
     """
     order, count, mean = np.argsort(lines.tau), 0, np.zeros(2)
@@ -527,7 +522,7 @@ def _go_with_rows(lines: Lines, chosen: BoolArray1) -> float:
 
 
 def _clearly_moving(given: _Given) -> bool:
-    """True if neither rest nor another typical speed would change anything."""
+    """Return True if neither rest nor another typical speed would change anything."""
     turn_known = given.assumed.turn is not None
     first = LINEAR.start if turn_known else VELOCITIES.start  # of the others a gyroscope knows
     place = slice(first, VELOCITIES.stop)

@@ -1,9 +1,9 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The Gaussian of one hypothesis, and before a plane that of its leans.
+"""The Gaussian of one hypothesis, and of its leans before a plane.
 
-Laplace's approximation about the optimum; where a plane's lean is hardly known, nested (Rue,
-Martino, Chopin 2009): one beside each lean of a grid.
+It is Laplace's approximation about the optimum. If a plane's lean is hardly known, it is nested
+(Rue, Martino, Chopin 2009): one Gaussian beside each lean of a grid.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Mode(NamedTuple):
 
 @entry
 def linear_at(frame: Frame, state: Array1) -> Linear:
-    """The products at a state (24,) without an in-frame turn."""
+    """Return the products at a state (24,) without an in-frame rotation."""
     count = len(frame.chosen)
     lines = linearized(frame.data, count, state, np.zeros((count, 6)))
     return linear_of(lines, frame.chosen, False, frame.shared.rows)
@@ -91,7 +91,7 @@ def linear_at(frame: Frame, state: Array1) -> Linear:
 def mode_of(
     frame: Frame, start: Array1, linear: Linear, terms: PriorTerms
 ) -> tuple[Mode, Array, Linear]:
-    """The Gaussian about the optimum near a state (24,), at which the products are.
+    """Return the Gaussian about the optimum near a state (24,), where the products are.
 
     And the state and the products of the last linearization: the next one may begin there.
     """
@@ -122,7 +122,7 @@ def mode_of(
 
 @inlined
 def _bent(step: Array, frame: Frame) -> float:
-    """How far (px) a step leaves its tangent: the square of all that it turns."""
+    """Return how far (px) a step leaves its tangent: the square of all that it rotates."""
     total = 0.0
     for k in range(0, PARAMETERS, 3):
         length = math.sqrt(step[k] ** 2 + step[k + 1] ** 2 + step[k + 2] ** 2)
@@ -132,7 +132,7 @@ def _bent(step: Array, frame: Frame) -> float:
 
 
 def over_leans(frame: Frame, mode: Mode, terms: PriorTerms) -> Mode:
-    """The mode of a plane, integrated over its leans where they are hardly known."""
+    """Integrate the mode of a plane over its leans, if they are hardly known."""
     held = frame._replace(
         shared=frame.shared.at(mode.size), noise=frame.noise._replace(deviation=mode.noise)
     )
@@ -149,7 +149,7 @@ def over_leans(frame: Frame, mode: Mode, terms: PriorTerms) -> Mode:
 
 @kernel
 def _evidence_of(mode: Mode, least: float, freedom: float) -> float:
-    """Evidence where the noise is of the errors that the least cost leaves.
+    """Return the evidence with the noise that the least cost leaves.
 
     Student's: what a motion leaves beyond the best one tells the less, the fewer the points.
     """
@@ -159,8 +159,8 @@ def _evidence_of(mode: Mode, least: float, freedom: float) -> float:
 
 @entry
 def _leans(frame: Frame, mode: Mode, terms: PriorTerms) -> tuple[Array, Array, Array, float]:
-    """Gaussians beside the leans of a grid, along the one or two axes about which they are hardly
-    known. Noise, inliers and the size of the smooth error are those of the mode.
+    """Return Gaussians beside the leans of a grid, along the one or two axes that are hardly known.
+    Noise, inliers and the size of the smooth error are taken from the mode.
 
     Returns:
         states (k,24), covariances (k,18,18), evidences (k,), of nothing where the lean is known;

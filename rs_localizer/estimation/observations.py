@@ -72,7 +72,7 @@ _LEAST_EXTENT = 5.0
 def checked(
     points: ArrayLike, pixels: ArrayLike, scores: ArrayLike | None
 ) -> tuple[Array, Array, Array | None]:
-    """Points (n,3), pixels (n,2) and scores (n,) as contiguous float64 arrays.
+    """Return points (n,3), pixels (n,2) and scores (n,) as contiguous float64 arrays.
 
     OpenCV's (n,1,3) and (n,1,2) are taken, too.
 
@@ -109,8 +109,7 @@ def checked(
 def checked_of_rig(
     rig: Rig, parts: Mapping[str, Sequence[ArrayLike]], stamps: Mapping[str, float] | None
 ) -> tuple[Exposure, list[int], Array, Array, Array | None]:
-    """When and from where a frame is seen, how many points each camera sees, and the points,
-    pixels and scores of all, as :func:`checked`.
+    """Return exposure, points per camera, and all points, pixels and scores, as :func:`checked`.
 
     Args:
         parts: (points, pixels) or (points, pixels, scores) by the names of the cameras.
@@ -140,7 +139,7 @@ def checked_of_rig(
 
 
 def unfit(exposure: Exposure, pixels: Array, usable: Usable, needed: int) -> Failure | None:
-    """Reason for which points cannot carry a pose whatever the motion, or None.
+    """Return why points cannot carry a pose whatever the motion, or None.
 
     Args:
         pixels: (n,2) of all points.
@@ -169,10 +168,7 @@ def unfit(exposure: Exposure, pixels: Array, usable: Usable, needed: int) -> Fai
 def pack(
     points: Array2, rays: Array2, tau: Array1, by_ray: Array3, camera: IntArray1, mounts: Mounts
 ) -> Array:
-    """Points in lanes: (blocks, values, LANES) of points (n,3), rays (n,2), row times (n,),
-    derivatives of the pixel by the ray (n,2,2), and of which camera (n,) they are. The last block
-    is filled up with weight zero.
-    """
+    """Pack points (n,3), rays (n,2), row times, derivatives (n,2,2) and cameras (n,) in lanes."""
     count = len(points)
     blocks = (count + LANES - 1) // LANES
     data = np.empty((blocks, POINT_SIZE * LANES))
@@ -200,7 +196,7 @@ def pack(
 
 @entry
 def thin(data: Array2, chosen: IntArray1) -> Array:
-    """Only the chosen ones of the packed points, packed anew."""
+    """Pack only the chosen ones of the packed points anew."""
     count = len(chosen)
     blocks = (count + LANES - 1) // LANES
     thinned = np.empty((blocks, POINT_SIZE * LANES))
@@ -216,7 +212,7 @@ def thin(data: Array2, chosen: IntArray1) -> Array:
 
 @kernel
 def weighted(data: Array, weights: Array | BoolArray) -> Array:
-    """The packed points with these weights (n,): 1 or 0."""
+    """Return the packed points with these weights (n,): 1 or 0."""
     data = data.copy()
     for i in range(len(weights)):
         data[i // LANES, WEIGHT * LANES + i % LANES] = weights[i]
@@ -250,7 +246,7 @@ class Observations:
         return cls(points, rays, tau, camera, mounts, packed, len(points))
 
     def only(self, chosen: IntArray) -> Observations:
-        """These of the points."""
+        """Return the observations of these points."""
         packed = thin(self.packed, chosen)
         return Observations(
             self.points[chosen], self.rays[chosen], self.tau[chosen], self.camera[chosen],
@@ -261,17 +257,17 @@ class Observations:
         return self.count
 
     def squared_errors(self, state: Array) -> Array:
-        """Squared reprojection errors (n,) in raw pixels."""
+        """Return squared reprojection errors (n,) in raw pixels."""
         errors: Array = squared_errors(self.packed, self.count, state)
         return errors
 
     def within(self, state: Array, distance: float) -> BoolArray:
-        """Mask (n,) of points that are reprojected to within a distance (px)."""
+        """Return a mask (n,) of points that are reprojected to within a distance (px)."""
         near: BoolArray = squared_errors(self.packed, self.count, state) < distance**2
         return near
 
     def median_depth(self, state: Array, chosen: BoolArray) -> float:
-        """Median depth of some points before their cameras (chosen: (n,)); NaN: none."""
+        """Return the median depth of chosen points (n,) before their cameras; NaN: none."""
         depth: float = median_depth(self.packed, state, chosen)
         return depth
 
@@ -292,17 +288,18 @@ def relinearized(
     turn: GyroRotation | None,
     fewest: int = _MANY,
 ) -> Observations:
-    """The same observations with derivatives at a motion near the best; few points as they are.
+    """Return observations with derivatives at a motion near the best; few points stay.
 
-    Taken where the points were measured, derivatives of pixels by rays have the noise of the points
-    in them. Through a lens that bends much (a fisheye), and by a known turn, that makes the columns
-    of a motion differ a little from fields of errors that it can mimic, in step with the errors:
-    thousands of points take it for a map or a lens that is wrong.
+    Derivatives of pixels by rays that are taken where the points were measured have the noise of
+    the points in them. Through a lens that bends much (a fisheye), or with a known rotation, the
+    columns of a motion then differ a little from fields of errors that it can mimic. That
+    difference is in step with the errors, and thousands of points would take it for a wrong map or
+    lens.
 
     Args:
         state: (24,) of the motion.
-        turn: what the observations are compensated by.
-        fewest: points that are not few.
+        turn: the known rotation that was taken out of the observations.
+        fewest: number of points from which on they are linearized anew.
     """
     count = observations.count
     if count < fewest or (turn is None and all(len(each.D) == 0 for each in exposure.cameras)):
@@ -334,7 +331,7 @@ def lines_about(
     motion: Motion,
     turn: GyroRotation | None = None,
 ) -> Lines:
-    """The sound ones of points (n,3) and pixels (n,2) of a camera alone, linearized at a motion."""
+    """Linearize the sound points (n,3) and pixels (n,2) of a single camera at a motion."""
     usable = find_usable(exposure, points, pixels, [len(pixels)], turn)
     seen = packed(exposure, points, usable)
     state, count = state_in(motion, usable.centre), len(seen)
@@ -344,7 +341,7 @@ def lines_about(
 
 
 def rays_of_lens(turn: GyroRotation | None, tau: Array, rays: Array) -> Array:
-    """Rays (n,2) as they come in at row times (n,), out of which a known turn was taken."""
+    """Return rays (n,2) at row times (n,) with the known rotation that was taken out."""
     if turn is None:
         return rays
     turned = turn.at_rows(tau)[0]
@@ -432,7 +429,7 @@ def find_usable(
 def _rays(
     exposure: Exposure, place: int, pixels: Array, tau: Array, turn: GyroRotation | None
 ) -> tuple[Array, Array, IntArray]:
-    """Rays as of :meth:`Exposure.look`, compensated."""
+    """Return rays as of :meth:`Exposure.look`, compensated."""
     rays, by_ray, side = exposure.look(place, pixels)
     if turn is not None:
         gradient = exposure.mounts.gradients[0]  # of a camera alone
@@ -444,7 +441,7 @@ def _rays(
 def _select(
     points: Array2, pixels: Array2, rays: Array2, side: IntArray1, sizes: Array2, keys: Array1
 ) -> tuple[IntArray, BoolArray, Array, float, bool]:
-    """Places of points that can be used, but for copies.
+    """Return places of usable points, without copies.
 
     Args:
         side: (n,) by which each is seen, of a camera with an image of a size (k,2).
@@ -487,7 +484,7 @@ def _select(
 
 
 def packed(exposure: Exposure, points: Array, usable: Usable) -> Observations:
-    """The usable points (of these (n,3)), relative to their median."""
+    """Pack the usable points (of these (n,3)), relative to their median."""
     indices, mounts = usable.indices, exposure.mounts
     near, bearing, times, of_camera, lanes = _packed(
         points, usable.rays, usable.tau, usable.by_ray, usable.camera, indices, usable.centre,
@@ -502,7 +499,7 @@ def _packed(
     indices: IntArray1,
     centre: Array1, mounts: Mounts,
 ) -> tuple[Array, Array, Array, IntArray, Array]:  # fmt: skip
-    """Points, bearings, row times and cameras at these indices, and all packed."""
+    """Return points, bearings, row times and cameras at these indices, and all packed."""
     near, bearing, times, chosen = points[indices], rays[indices], tau[indices], camera[indices]
     for i in range(len(near)):
         for axis in range(3):

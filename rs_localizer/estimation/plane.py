@@ -1,10 +1,9 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Points on a plane: whether they are, its other views, and the turn that is known worst.
+"""Points on a plane: a test, its other views, and the rotation that is known worst.
 
-From far away, or on a small marker, a plane that leans to the left and one that leans to the right
-look alike but for perspective (Schweighofer, Pinz, "Robust pose estimation from a planar target",
-PAMI 2006).
+From far away, or on a small marker, planes that lean to the left and to the right look alike up to
+perspective. (Schweighofer, Pinz, "Robust pose estimation from a planar target", PAMI 2006.)
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ _LEAST_LEAN = 0.01
 def leaning_less(
     points: Array2, inliers: BoolArray1, state: Array1, leans: float
 ) -> tuple[bool, Array]:
-    """True and the state (24,) whose view of the plane leans by so many times its lean less.
+    """Return True and the state (24,) with the plane's lean reduced so many times.
 
     Twice its lean less it is mirrored, once it faces the camera. False if the points (n,3) that
     count are no plane, or face the camera.
@@ -64,7 +63,7 @@ def leaning_less(
 
 @entry
 def plane_of(points: Array2, inliers: BoolArray1) -> tuple[bool, Array, Array]:
-    """True if the points that count lie on a plane, their centre (3,) and its normal (3,)."""
+    """Return True if the counted points lie on a plane, its centre (3,) and normal (3,)."""
     centre, spread, count = np.zeros(3), np.zeros((3, 3)), 0
     for i in range(len(points)):
         if inliers[i]:
@@ -88,5 +87,5 @@ def plane_of(points: Array2, inliers: BoolArray1) -> tuple[bool, Array, Array]:
 
 @entry
 def longest_axis(covariance: Array2) -> float:
-    """Standard deviation (rad) of the turn about the axis that is known worst."""
+    """Return the deviation (rad) of the rotation about the axis that is known worst."""
     return math.sqrt(np.linalg.eigvalsh(covariance[:3, :3].copy())[-1])

@@ -96,7 +96,7 @@ class Posterior(NamedTuple):
 
 @entry
 def noise_deviation(squared_errors: Array1, gate: float, freedom: float) -> float:
-    """Standard deviation of the pixel noise from the errors within a gate.
+    """Return the standard deviation of the pixel noise from the errors within a gate.
 
     Args:
         squared_errors: (n,) of all points.
@@ -124,7 +124,7 @@ def noise_deviation(squared_errors: Array1, gate: float, freedom: float) -> floa
 
 @inlined
 def decided(inverse: Array2, prior: PriorTerms, noise: float) -> float:
-    """Number of parameters that the points decide, and not the prior.
+    """Count the parameters that the points decide, and not the prior.
 
     Args:
         inverse: (18,18) of the information of both, px^-2.
@@ -141,7 +141,7 @@ def decided(inverse: Array2, prior: PriorTerms, noise: float) -> float:
 
 @inlined
 def _least_eigenvalue(information: Array, inverse: Array) -> float:
-    """Least eigenvalue of an information matrix of unit diagonal; where large enough, a bound."""
+    """Return the least eigenvalue, or a bound if it is large, for a unit diagonal."""
     total = 0.0  # of the eigenvalues of the scaled inverse
     for i in range(len(information)):
         total += inverse[i, i] * information[i, i]

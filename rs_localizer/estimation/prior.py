@@ -67,7 +67,7 @@ def check_motion(motion: Motion) -> None:
 
 @entry
 def _is_finite(numbers: Array1) -> bool:
-    """True if the squares of numbers (n,) have a finite sum."""
+    """Return True if the squares of numbers (n,) have a finite sum."""
     total = 0.0
     for number in numbers:
         total += number * number
@@ -76,7 +76,7 @@ def _is_finite(numbers: Array1) -> bool:
 
 @entry
 def _is_rotation(matrix: Array2) -> bool:
-    """True if a matrix (3,3) is orthonormal, to rounding, and no mirror."""
+    """Return True if a matrix (3,3) is orthonormal, to rounding, and no mirror."""
     off = np.abs(matrix @ matrix.T - np.eye(3)).max()
     return bool(off <= _ROUNDING and np.linalg.det(matrix) > 0.0)
 
@@ -111,7 +111,7 @@ def _fault_of(covariance: Array2) -> int:
 
 @inlined
 def _is_positive(matrix: Array, scale: Array) -> bool:
-    """True if a matrix, scaled to a unit diagonal, is positive definite; by Cholesky."""
+    """Return True if a matrix, scaled to a unit diagonal, is positive definite (Cholesky)."""
     size = len(matrix)
     factor = np.empty((size, size))
     for i in range(size):
@@ -223,7 +223,7 @@ _STILL = np.concatenate([np.eye(3).ravel(), np.zeros(STATE_SIZE - 9)])
 
 
 def motion_terms(velocities: Sequence[float], accelerations: Sequence[float]) -> PriorTerms:
-    """Zero-mean prior of these standard deviations, each angular and linear; 0: none.
+    """Return a zero-mean prior with these standard deviations, angular and linear; 0: none.
 
     Args:
         velocities: rad and m per readout.
@@ -235,14 +235,14 @@ def motion_terms(velocities: Sequence[float], accelerations: Sequence[float]) ->
 
 @cache
 def held_terms() -> PriorTerms:
-    """A global shutter: velocities and accelerations are zero."""
+    """Return the prior of a global shutter: velocities and accelerations are zero."""
     precisions = np.repeat([0.0, _LEAST_DEVIATION**-2], [6, 12])
     return _single(np.diag(precisions), _STILL)
 
 
 @entry
 def terms_at(terms: PriorTerms, speed: float, turn_known: bool) -> PriorTerms:
-    """The prior of a typical speed, a part of the configured one; 0: of a camera at rest.
+    """Return the prior of a typical speed, a part of the configured one; 0: at rest.
 
     Neither travel nor accelerations slow down as much as turns: who hardly turns may walk, and
     jolts come at any speed. At rest, only gravity is as in the terms. What a gyroscope leaves of a
@@ -268,7 +268,7 @@ def terms_at(terms: PriorTerms, speed: float, turn_known: bool) -> PriorTerms:
 
 @entry
 def _with_turn(informations: Array3, error: Array2) -> Array:
-    """Prior of a motion beside a known turn; error (6,6): see ``GyroRotation.error``."""
+    """Return the prior of a motion beside a known rotation; error (6,6): ``GyroRotation.error``."""
     changed, precision = informations.copy(), np.linalg.inv(error)
     for i in range(6):
         for j in range(6):
@@ -288,7 +288,7 @@ def _single(information: Array, reference: Array) -> PriorTerms:
 
 
 def with_measurements(terms: PriorTerms, prior: Prior) -> PriorTerms:
-    """The terms and what a prior says but for the motion: angular velocity and gravity."""
+    """Add the angular velocity and gravity of a prior to the terms."""
     informations, references, gravity, pivots = terms
     if prior.angular_velocity is not None:
         information = np.zeros((PARAMETERS, PARAMETERS))
@@ -310,14 +310,14 @@ def with_measurements(terms: PriorTerms, prior: Prior) -> PriorTerms:
 
 
 def knows_motion(prior: Prior) -> bool:
-    """True if a prior's motion is more than a first guess."""
+    """Return True if a prior's motion is more than a first guess."""
     return prior.covariance is not None and not np.isinf(np.diagonal(prior.covariance)).all()
 
 
 def with_motion(
     terms: PriorTerms, prior: Prior, centre: Array, turn_known: bool = False
 ) -> PriorTerms:
-    """The terms and a prior's motion in the map frame, for points relative to ``centre`` (3,).
+    """Add a prior's motion in the map frame, for points relative to ``centre`` (3,).
 
     Its term, if it knows anything, is the last one. Beside a known turn it knows the gyroscope's
     errors, too.
@@ -350,7 +350,7 @@ def _with_motion(
 
 @entry
 def pivot_of(covariance: Array2) -> Array:
-    """The point (3,), in camera axes, of which is known best where the camera sees it.
+    """Return the point (3,), in camera axes, whose place in the view is known best.
 
     Who turns about it moves by its distance times the turn: that is the part of the move that goes
     with the turn. A camera that a measured position holds turns about itself.
@@ -370,7 +370,7 @@ def pivot_of(covariance: Array2) -> Array:
 
 @inlined
 def _inverse(covariance: Array) -> Array:
-    """Information (18,18) of a covariance, zero for parameters of infinite variance."""
+    """Return the information (18,18) of a covariance, zero for infinite variances."""
     places = np.flatnonzero(np.isfinite(np.diag(covariance)))
     known = len(places)
     block, information = np.empty((known, known)), np.zeros((PARAMETERS, PARAMETERS))
@@ -460,7 +460,7 @@ def _add_posed(
 
 @entry
 def offset_between(reference: Array1, state: Array1, pivot: Array1) -> tuple[Array, Array]:
-    """The offset (18,) from one state to another, and its derivative (6,3) by a turn from there.
+    """Return the offset (18,) between two states, and its derivative (6,3) by a rotation.
 
     Its turn ``phi`` is that of a step, its move what turns and then sees the pivot ``p`` at ``q``:
 
@@ -519,7 +519,7 @@ def _pose_offset(
 def _add_gravity(
     gravity: Array, state: Array, weight: float, information: Array, slope: Array
 ) -> float:
-    """Part of the measured direction: |R g - m|^2 times its precision."""
+    """Add the cost of the measured direction: |R g - m|^2 times its precision."""
     precision = weight * gravity[6]
     seen = np.empty(3)
     for i in range(3):
@@ -556,7 +556,7 @@ class TurnSeen:
     typical_variance: float  # of each axis, by the prior of the motion
 
     def evidence(self, speed: float) -> float:
-        """Logarithm of the likelihood of a typical speed, but for a constant."""
+        """Return the log likelihood of a typical speed, up to a constant."""
         variance = self.variance + speed**2 * self.typical_variance
         return -0.5 * (self.squared_rate / variance + 3.0 * math.log(variance))
 
@@ -576,7 +576,7 @@ class Assumed:
 def assumptions(
     span: float, rig: Rig, config: LocalizerConfig, solver: Solver
 ) -> tuple[PriorTerms, Assumed]:
-    """Assumptions of the configuration on motion, cameras and map, per span of the row times.
+    """Return the configured assumptions on motion, cameras and map, per span of the row times.
 
     Args:
         span: s; 0: unknown.
@@ -603,9 +603,7 @@ def assumptions(
 def of_frame(
     terms: PriorTerms, assumed: Assumed, prior: Prior | None, turn: GyroRotation | None
 ) -> tuple[PriorTerms, Assumed]:
-    """The terms of the configuration and the assumptions with what is known of this frame, but for
-    its motion: by a gyroscope, and of rest.
-    """
+    """Add knowledge of this frame, by a gyroscope or of rest, to terms and assumptions."""
     if turn is not None:
         assumed = replace(assumed, turn=turn_seen(terms, turn))
         terms = terms._replace(informations=_with_turn(terms.informations, turn.error))
@@ -616,7 +614,7 @@ def of_frame(
 
 
 def turn_seen(terms: PriorTerms, turn: GyroRotation) -> TurnSeen:
-    """Speed by a known turn, beside the prior of the configuration."""
+    """Return the speed by a known rotation, beside the configured prior."""
     variance = sum(turn.error.diagonal()[:3].tolist()) / 3.0 + turn.rate_noise**2
     precision = float(terms.informations[0, ANGULAR.start, ANGULAR.start])
     typical = 1.0 / precision if precision > 0.0 else math.inf

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The robust loop: draw samples in blocks, solve, score, optimise the best, stop when sure.
+"""The robust loop: draw samples in blocks, solve, score, optimize the best, stop when sure.
 
 It knows a solver only as a function that turns samples into models.
 """
@@ -37,7 +37,7 @@ from rs_localizer.solvers.table import Solver
 
 
 def generator(seed: int) -> Random:
-    """A random generator that kernels can draw from."""
+    """Return a random generator that kernels can draw from."""
     return np.array([seed], dtype=np.uint64)
 
 
@@ -67,7 +67,7 @@ def pools_of(
     camera: IntArray1, tau: Array1, cameras: int, size: int, among: BoolArray1, ranking: IntArray1,
     also_all: bool,
 ) -> Pools:  # fmt: skip
-    """A pool for each camera that has enough points for a sample.
+    """Return a pool for each camera with enough points for a sample.
 
     Half of the samples ignore the scores, so that wrong ones cost a factor of two at most.
 
@@ -127,7 +127,7 @@ def prefix_sizes(total: int, first: int, size: int, prefixes: IntArray) -> None:
 
 @inlined
 def _next(random: Any) -> Any:
-    """SplitMix64 (Steele, Lea, Flood, OOPSLA 2014): the next 64 bits; ``random`` is (1,) uint64."""
+    """Return the next 64 bits of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014); ``random`` (1,)."""
     random[0] += np.uint64(0x9E3779B97F4A7C15)
     z = random[0]
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -183,7 +183,7 @@ def _draw_block(
         first, begin = last, pools.ends[k]
 
 
-# Of local optimisation, at the last scale.
+# Of local optimization, at the last scale.
 _ITERATIONS = 3
 # Steps of a descent: at its first scale, where it has far to go, and at each of the others.
 _FIRST_STEPS, _STEPS, _RATIO = 20, 3, 0.6
@@ -209,7 +209,7 @@ def state_of_model(model: Array) -> Array:
 def best_models(
     models: Array, data: Array, scale: float, keep: int, bar: float
 ) -> tuple[Array, Array]:
-    """States (keep,24) and costs (keep,) of the models (k,18,h) with the least truncated error.
+    """Return states (keep,24) and costs (keep,) of models (k,18,h) with the least truncated error.
 
     A model is left as soon as its cost exceeds that of the worst kept one, or ``bar``. Places that
     no model takes have infinite cost.
@@ -246,7 +246,7 @@ def optimize(
     prior: PriorTerms,
     noise: float,
 ) -> tuple[Array, float]:
-    """Local optimisation of the states with finite cost; the best state and its truncated cost.
+    """Optimize states with finite cost locally; return the best state and its truncated cost.
 
     Each is refined on all points under Tukey's loss while its scale falls from the first to the
     last; the truncated cost is that of the last scale.
@@ -275,7 +275,7 @@ def descend(
     prior: PriorTerms,
     noise: float,
 ) -> tuple[Array, float]:
-    """Optimum as of :func:`optimize`, of one state, with steps tried before they are taken.
+    """Optimize one state as :func:`optimize`, with steps tried before they are taken.
 
     It takes ten times as long and comes through where pose and motion are hard to tell apart.
     """
@@ -287,7 +287,7 @@ def descend(
     return state, truncated_cost(data, state, last_scale, np.inf)
 
 
-# Of every block this many hypotheses are optimised: a six-point model of inliers alone is often
+# Of every block this many hypotheses are optimized: a six-point model of inliers alone is often
 # not the first in a block, because noise makes it miss most of the other inliers.
 _KEEP = 2
 
@@ -313,7 +313,7 @@ class Hypotheses(NamedTuple):
     solver: Solver
     block: int  # samples per block
     score_scale: float  # px, truncation of the error of minimal models
-    final_scale: float  # px, truncation after local optimisation: the inlier threshold
+    final_scale: float  # px, truncation after local optimization: the inlier threshold
     noise: float  # px, expected standard deviation
     iterations: int  # of an iterative solver
     optimized: bool = True  # False: minimal models are judged as they are
@@ -333,13 +333,13 @@ def search(
     observations: Observations, hypotheses: Hypotheses, prior: PriorTerms, draws: Draws,
     start: Candidate,
 ) -> Candidate:  # fmt: skip
-    """The best optimised hypothesis of up to ``draws.most`` minimal samples.
+    """Return the best optimized hypothesis of up to ``draws.most`` minimal samples.
 
     Blocks draw equally from all pools. The search stops
     when the chance that no sample so far held inliers alone, at the inlier ratios of the best
-    *optimised* motion, is below ``1 - draws.confidence``: minimal models see too few of the inliers
+    *optimized* motion, is below ``1 - draws.confidence``: minimal models see too few of the inliers
     to count them (a six-point model sees a tenth). Only models that beat all minimal ones before
-    are optimised (LO-RANSAC: Chum, Matas, Kittler, DAGM 2003). Where none is, the best minimal
+    are optimized (LO-RANSAC: Chum, Matas, Kittler, DAGM 2003). Where none is, the best minimal
     model counts, and the search ends late.
     """
     solver, pools, mounts = hypotheses.solver, draws.pools, observations.mounts
@@ -376,17 +376,17 @@ def _judge(
     least: float, scales: tuple[float, float, float], bar: float, prior: PriorTerms, pools: Pools,
     drawn: IntArray1, shares: Out[Array1], size: int, optimized: bool,
 ) -> tuple[Array, float, float, float]:  # fmt: skip
-    """Optimise the best of a block's models.
+    """Optimize the best of a block's models.
 
     Args:
         models: (k,18,h), of the cameras (h,).
-        best, least: the best optimised state so far, and its cost.
-        scales: px, truncation of minimal models and of optimised ones, expected noise.
-        bar: cost that a minimal model must stay below to be optimised.
+        best, least: the best optimized state so far, and its cost.
+        scales: px, truncation of minimal models and of optimized ones, expected noise.
+        bar: cost that a minimal model must stay below to be optimized.
         drawn: (p,) samples from each pool until now, of ``size`` points.
         shares: (p,) of its points that are inliers of the best state, kept up to date; NaN: not
             counted yet.
-        optimized: whether the best are optimised.
+        optimized: whether the best are optimized.
 
     Returns:
         the best state and its cost; the least cost of a minimal model; and the chance that none of

@@ -37,7 +37,7 @@ _ANNEALING_DAMPING, _ANNEALING_RATIO = 1e-4, 0.6
 
 @entry
 def apply_step(state: Array1, step: Array1) -> Array:
-    """The state moved by a step (18,), or (12,) that leaves the accelerations."""
+    """Move a state by a step (18,), or (12,) that leaves the accelerations."""
     turn = exp(-step[0:3])
     moved = np.empty(STATE_SIZE)
     for i in range(3):
@@ -57,7 +57,7 @@ def apply_step(state: Array1, step: Array1) -> Array:
 
 @entry
 def solve_positive(matrix: Array2, right: Array1) -> tuple[Array, bool]:
-    """Solution of a symmetric positive definite system by Cholesky, and whether it is one."""
+    """Solve a symmetric positive definite system by Cholesky; return whether it is one."""
     size = len(right)
     # Scaling to a unit diagonal makes radians and metres comparable.
     scale = np.empty(size)
@@ -104,7 +104,7 @@ def _posterior(
     information: Array,
     slope: Array,
 ) -> float:
-    """Normal equations and cost with the prior, in squared pixels."""
+    """Return normal equations and cost with the prior, in squared pixels."""
     cost = normal_equations(data, state, scale, softness, looks, information, slope)
     return cost + add_prior(prior, state, noise * noise, information, slope)
 
@@ -253,14 +253,14 @@ def half_inverse(matrix: Array) -> tuple[Array, Array, bool]:
 
 @entry
 def inverted(matrix: Array2) -> Array:
-    """Inverse of a symmetric positive definite matrix; NaN where it is none."""
+    """Return the inverse of a symmetric positive definite matrix; NaN if it is none."""
     half, scale, positive = half_inverse(matrix)
     return squared(half, scale) if positive else np.full(matrix.shape, np.nan)
 
 
 @kernel
 def squared(half: Array, scale: Array) -> Array:
-    """The inverse of which :func:`half_inverse` is the half."""
+    """Return the inverse whose half :func:`half_inverse` is."""
     size = len(scale)
     inverse = np.zeros((size, size))
     for k in range(size):
@@ -278,7 +278,7 @@ def squared(half: Array, scale: Array) -> Array:
 
 @entry
 def smallest_eigenvalue(information: Array2) -> float:
-    """Least eigenvalue of an information matrix scaled to a unit diagonal; 0 where it is none."""
+    """Return the least eigenvalue of information scaled to a unit diagonal; 0 if none."""
     size = len(information)
     scaled = np.empty((size, size))
     for i in range(size):

@@ -3,17 +3,17 @@
 """Reprojection errors of many points under one motion, and their normal equations.
 
 Points lie in lanes (:func:`rs_localizer.estimation.observations.pack`); a motion is a state of
-:mod:`rs_localizer.core.state`. Each point is seen by a camera of a rig: the motion, that of the
-rig, takes it to its place ``Y`` before the rig at its row time, and the camera, whose centre in the
-rig is ``c`` and whose axes are ``R``, sees it at ``R (Y - c)``. A single camera is its own rig.
+:mod:`rs_localizer.core.state`. Each point is seen by a camera of a rig. The motion of the rig takes
+the point to its place ``Y`` before the rig at its row time. The camera, whose centre in the rig is
+``c`` and whose axes are ``R``, sees it at ``R (Y - c)``. A single camera is its own rig.
 
-The error of a point is measured where the model puts it on the image, although the model is
-evaluated at the *measured* row: noise of the row is noise of the time. With ``m`` the velocity of
-the image point in pixels per unit of row time, ``g`` the gradient of the row time by the pixel and
-``e`` the error at the measured row time, the point that satisfies its own row time lies at
-``(I - m g^T)^-1 e`` to first order, and there the noise is that of the pixels. From a row time
-``d`` later than the measured one the error is ``(I - m g^T)^-1 (e - m d)``: a second look at the
-row that the first one found leaves out terms of third order only.
+The error of a point is measured at its modelled place on the image, although the model is evaluated
+at the *measured* row: noise of the row is noise of the time. Let ``m`` be the velocity of the image
+point in pixels per unit of row time, and ``e`` the error at the measured row time. Let ``g`` be the
+gradient of the row time by the pixel. To first order the point that satisfies its own row time lies
+at ``(I - m g^T)^-1 e``, where the noise is the noise of the pixels. From a row time ``d`` later
+than the measured one the error is ``(I - m g^T)^-1 (e - m d)``: a second look at the row that the
+first one found leaves out terms of third order only.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _FARTHEST_LOOK = 0.1
 
 
 def _series(x: Any, first_factorial: int) -> Any:
-    """``sum_k (-x)^k / (2 k + first_factorial)!`` by Horner's rule."""
+    """Return ``sum_k (-x)^k / (2 k + first_factorial)!`` by Horner's rule."""
     total: Any = 0.0
     for k in reversed(range(_SERIES_TERMS)):
         total = total * x + (-1.0) ** k / math.factorial(2 * k + first_factorial)
@@ -58,7 +58,7 @@ def _series(x: Any, first_factorial: int) -> Any:
 
 
 def _outer_turn(theta: Vector, s: Any, c: Any) -> list[Vector]:
-    """Rotation matrix of the rotation vector theta with its coefficients."""
+    """Return the rotation matrix of the rotation vector theta with its coefficients."""
     x, y, z = theta
     cx, cy, cz = c * x, c * y, c * z
     return [
@@ -154,7 +154,7 @@ class View:
         self.squared = select(seen, dot(self.error, self.error), math.inf)
 
     def _rate(self) -> Vector:
-        """Velocity of the point in the rig's axes, per unit of row time."""
+        """Return the velocity of the point in the rig's axes, per unit of row time."""
         omega, velocity = self._omega, self._velocity
         if self._accelerating:
             now = [w + self.tau * a for w, a in zip(omega, self._alpha, strict=True)]
@@ -184,7 +184,7 @@ class View:
         return self.weight * select(self.squared < self.scale, self.squared, self.scale)
 
     def robust(self) -> tuple[Any, Any]:
-        """Root of the weight, and cost, of the error: truncated (softness 0) or Tukey's (1)."""
+        """Return root weight and cost of the error: truncated (softness 0) or Tukey's (1)."""
         ratio = self.squared * self._inverse_scale
         inside = ratio < 1.0
         base = 1.0 - self.softness * select(inside, ratio, 0.0)
@@ -195,7 +195,7 @@ class View:
         return weight, cost
 
     def jacobian(self) -> list[Vector]:
-        """Derivatives of the error by the parameters, two rows: 12, and with two looks 18."""
+        """Return derivatives of the error by the parameters, two rows: 12, with two looks 18."""
         alpha = [-x for x in self.theta]
         before_shake = self.turn
         rows = []
@@ -219,7 +219,7 @@ class View:
         return rows
 
     def by_shake(self) -> list[Vector]:
-        """Derivatives of the error by a turn (3) of the rig in its own axes at this row."""
+        """Return derivatives of the error by a rotation (3) of the rig at this row."""
         return [cross(row, self.rig_point) for row in self._by_rig_point()]
 
     def _by_rig_point(self) -> list[Vector]:
@@ -236,7 +236,7 @@ def _matrix(values: Sequence[Lanes]) -> list[Vector]:
 
 
 def _seen(rig_point: Vector, axes: list[Vector], centre: Sequence[Lanes]) -> Vector:
-    """A point before a rig, in the axes of one of its cameras."""
+    """Return a point before a rig, in the axes of one of its cameras."""
     return multiply(axes, [a - b for a, b in zip(rig_point, centre, strict=True)])
 
 
@@ -245,7 +245,7 @@ def _transposed(matrix: list[Vector], vector: Vector) -> Vector:
 
 
 def still_cost(values: Sequence[Lanes]) -> Any:
-    """:attr:`View.truncated` of a camera at rest, for which there is less to compute."""
+    """Return :attr:`View.truncated` of a camera at rest, which takes less."""
     point, ray, by_ray = values[0:3], values[3:5], [values[6:8], values[8:10]]
     state = values[POINT_SIZE : POINT_SIZE + STATE_SIZE]
     moved = multiply([state[0:3], state[3:6], state[6:9]], point)
@@ -267,7 +267,7 @@ def _tile(higher: range, lower: range) -> list[tuple[int, int]]:
 
 
 def _tiles(parameters: int) -> list[list[tuple[int, int]]]:
-    """All pairs of columns, the last of which is the error, in tiles whose sums fit registers."""
+    """Return all pairs of columns, the last one the error, in tiles that fit registers."""
     columns = parameters + 1
     groups = [range(k, min(k + 4, columns)) for k in range(0, columns, 4)]
     if len(groups[-1]) == 1:
@@ -351,7 +351,7 @@ def spread_state(state: Array, scale: float, softness: float, uniform: Array) ->
 
 @entry
 def squared_errors(data: Array2, count: int, state: Array1) -> Array:
-    """Squared reprojection errors (count,) in raw pixels; infinite behind the camera."""
+    """Return squared reprojection errors (count,) in raw pixels; infinite if behind."""
     uniform = np.empty(UNIFORM_SIZE * LANES)
     spread_state(state, 1.0, 0.0, uniform)
     block_errors = np.empty(LANES)
@@ -443,7 +443,7 @@ class Lines(NamedTuple):
 
 @entry
 def linearized(data: Array2, count: int, state: Array1, shake: Array2) -> Lines:
-    """Each point's error and its derivatives at a motion and what the camera turns beside it.
+    """Linearize each point's error at a motion and the vibration beside it.
 
     Args:
         data: packed points, ``count`` of them; weights are ignored.
@@ -480,7 +480,7 @@ def linearized(data: Array2, count: int, state: Array1, shake: Array2) -> Lines:
 
 @entry
 def likeness(points: Array2, numbers: Array1, neighbours: int) -> float:
-    """Mean product of numbers (n,) of points (n,3), and of so many nearest neighbours of each."""
+    """Return the mean product of numbers (n,) of points (n,3) and of their neighbours."""
     count, total = len(points), 0.0
     far, near = np.empty(neighbours), np.empty(neighbours)
     for i in range(count):

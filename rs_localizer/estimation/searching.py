@@ -74,7 +74,7 @@ class MotionSearch:
         )
 
     def find(self, observed: Observed) -> Candidate:
-        """The motion found from a global-shutter start, or nothing."""
+        """Find the motion from a global-shutter start, or nothing."""
         most = self._config.max_iterations
         if not self._solver.rolling_shutter:
             return self._global_shutter(observed, most)
@@ -82,7 +82,7 @@ class MotionSearch:
         return self._motion(observed, start, most)
 
     def among(self, observed: Observed, chosen: BoolArray, least: int) -> Candidate:
-        """The motion of these points alone, if more than so many agree roughly on a pose."""
+        """Find the motion of these points alone, if more than so many roughly share a pose."""
         part = replace(
             observed, observations=observed.observations.only(np.flatnonzero(chosen)),
             ranking=observed.ranking[:0],
@@ -96,11 +96,11 @@ class MotionSearch:
         return self._motion(part, start, _FEW_SAMPLES)
 
     def rough(self, observed: Observed) -> Candidate:
-        """A pose that fits all rows of enough points roughly; or nothing."""
+        """Find a pose that fits all rows of enough points roughly, or nothing."""
         return self._global_shutter(observed, _START_SAMPLES)
 
     def _global_shutter(self, observed: Observed, most: int) -> Candidate:
-        """A pose that fits all rows roughly, with a wide threshold."""
+        """Find a pose that fits all rows roughly, with a wide threshold."""
         observations = observed.observations
         pools = pools_of(
             observations.camera, observations.tau, len(observations.mounts.axes),
@@ -110,7 +110,7 @@ class MotionSearch:
         return search(observations, self._starts, held_terms(), draws, NOTHING)
 
     def _motion(self, observed: Observed, start: Candidate, most: int) -> Candidate:
-        """The motion that most points agree on, from the solver's hypotheses."""
+        """Find the motion that most points agree on, from the solver's hypotheses."""
         if not start.found:
             return start
         observations, threshold = observed.observations, self._config.inlier_threshold
@@ -137,7 +137,7 @@ class MotionSearch:
     def _facing(
         self, observed: Observed, start: Candidate, near: BoolArray, found: Candidate
     ) -> Candidate:
-        """A motion before a plane that faces the camera, where the start's own led nowhere.
+        """Find a motion before a plane that faces the camera, if the start led nowhere.
 
         Turning and moving stretch and shear the image of a plane, so that the global-shutter pose
         leans by tens of degrees; from there the way leads to other leans, and samples of six noisy
@@ -156,7 +156,7 @@ class MotionSearch:
     def optimize(
         self, observed: Observed, state: Array, first_scale: float, terms: PriorTerms
     ) -> Candidate:
-        """Local optimisation of one state down to the inlier threshold."""
+        """Optimize one state locally, down to the inlier threshold."""
         optimized, cost = optimize(
             state[None], np.zeros(1), observed.observations.packed, first_scale,
             self._config.inlier_threshold, terms, self._noise,
@@ -169,8 +169,8 @@ def _from_start(
     data: Array2, count: int, start: Array1, wide: float, threshold: float, prior: PriorTerms,
     noise: float,
 ) -> tuple[BoolArray, Array, float, int]:  # fmt: skip
-    """Which points may belong to a motion whose global-shutter pose this is; that motion and its
-    cost, by local optimisation; how many of the points agree with it.
+    """Return which points may belong to a motion with this global-shutter pose, and how many agree
+    with it; between them the motion and its cost, by local optimization.
     """
     near, agreeing = squared_errors(data, count, start) < wide * wide, 0
     states = start.copy().reshape(1, STATE_SIZE)

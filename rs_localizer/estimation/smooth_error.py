@@ -62,13 +62,13 @@ class Shared(NamedTuple):
     odds: Array1  # (s,) logarithms of their probabilities
 
     def at(self, size: float) -> Shared:
-        """The same of one size (px) that is known."""
+        """Return the shared errors with one size (px), which is known."""
         return self._replace(sizes=np.array([size]), odds=np.zeros(1))
 
 
 @entry
 def smooth_columns(by_motion: Array3, rays: Array2, bend: Array2) -> Array:
-    """Shifts (n,2,q) in px of points by each coefficient of a smooth error of 1 px.
+    """Return shifts (n,2,q) px of points by each coefficient of a smooth error of 1 px.
 
     Args:
         by_motion: (n,2,18) derivatives; a point that moves is a camera that moves back.
@@ -104,7 +104,7 @@ def smooth_columns(by_motion: Array3, rays: Array2, bend: Array2) -> Array:
 
 @kernel
 def _places_of(by_motion: Array, rays: Array) -> Array:
-    """Places (n,3) in image and depth, at most 1: depths are in parts of the scene's extent."""
+    """Return places (n,3) in image and depth, at most 1; depths relative to the scene."""
     places, low, high = np.empty((len(rays), 3)), np.full(5, np.inf), np.full(5, -np.inf)
     each = np.empty(5)
     for i in range(len(rays)):
@@ -130,7 +130,7 @@ def _places_of(by_motion: Array, rays: Array) -> Array:
 
 
 def bend_of(points: Array, inliers: BoolArray, size: float) -> Array:
-    """Functions (n,b) of the points' places; ``size``: m, their root mean square, all together."""
+    """Return functions (n,b) of the points' places with root mean square ``size`` (m)."""
     sizes = _BENT_SIZES
     chosen = points[inliers]
     low, high = chosen.min(axis=0), chosen.max(axis=0)
@@ -153,7 +153,7 @@ def bend_of(points: Array, inliers: BoolArray, size: float) -> Array:
 
 @entry
 def smooth_error(lines: Lines, chosen: BoolArray1, bend: Array2, size: float) -> Shared:
-    """The smooth error at the chosen ones of points (n,), orthogonal columns.
+    """Return the smooth error at the chosen points (n,), as orthogonal columns.
 
     Args:
         bend: (n,b), or (n,0): see :func:`smooth_columns`.
@@ -185,5 +185,5 @@ def smooth_error(lines: Lines, chosen: BoolArray1, bend: Array2, size: float) ->
 
 
 def nothing_shared(count: int) -> Shared:
-    """The errors that so many points share where there are none."""
+    """Return the shared errors of so many points if there are none."""
     return Shared(np.zeros((2 * count, 1)), np.zeros(1), np.zeros(1), np.zeros(1))

@@ -109,17 +109,17 @@ class ReadingBuffer:
         self._first, self._last = 0, count
 
     def _oldest(self) -> int:
-        """The row of the first reading that is remembered."""
+        """Return the row of the first reading that is remembered."""
         stamps = self._stamps[self._first : self._last]
         return self._first + int(stamps.searchsorted(stamps[-1] - MEMORY_NS))
 
     def lag(self, stamp_ns: int) -> int:
-        """Age (ns) of the newest reading at this moment; without one, the moment itself."""
+        """Return the age (ns) of the newest reading at this moment; without one, the moment."""
         with self._lock:
             return stamp_ns - (int(self._stamps[self._last - 1]) if len(self) else 0)
 
     def rate(self) -> float:
-        """Readings per second, by the median of the last steps; NaN for less than two."""
+        """Return the readings per second, by the median step; NaN for less than two."""
         with self._lock:
             steps = np.diff(self._stamps[self._first : self._last][-_RATE_COUNT:])
         return 1e9 / float(np.median(steps)) if len(steps) else math.nan
@@ -127,7 +127,7 @@ class ReadingBuffer:
     def between(
         self, start_ns: int, end_ns: int, since_ns: int | None = None, until_ns: int | None = None
     ) -> Readings | Unused:
-        """The readings that cover an interval, and those around it.
+        """Return the readings that cover an interval, and those around it.
 
         Args:
             start_ns, end_ns: of the IMU's clock; from the last reading before to the first after
@@ -203,7 +203,7 @@ def _outside(stamps: IntArray, start_ns: int, end_ns: int) -> Unused | None:
 
 
 def _apart(stamps: IntArray) -> IntArray:
-    """Places of readings (n,) that are kept, so that none is too close to the one before."""
+    """Return the places of kept readings (n,), so that none is too close to the last."""
     kept = [0]
     for i in range(1, len(stamps)):
         if stamps[i] - stamps[kept[-1]] >= _CLOSEST_NS:
@@ -212,7 +212,7 @@ def _apart(stamps: IntArray) -> IntArray:
 
 
 def _at_the_end_of_the_range(rates: Array, greatest: Array) -> BoolArray:
-    """Mask (n,) of readings (n,3) that show the greatest value so far, several times in a row."""
+    """Return a mask (n,) of readings (n,3) with the greatest value several times in a row."""
     found = np.zeros(len(rates), np.bool_)
     for axis in np.flatnonzero(greatest >= _SATURATED_RATE):
         same = np.abs(rates[:, axis]) == greatest[axis]

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The direction of gravity from an accelerometer.
 
-It shows the specific force: gravity, upwards, and the acceleration of the camera. One reading tells
-neither from the other: what pulls sideways by ``a`` makes it longer by ``a^2 / 2 g`` only. But no
-camera accelerates one way for long, so the readings of the last moments are turned into today's
-axes by the gyroscope, their mean is the direction, and how much they differ, from each other and
-from g in length, is how far it may be off.
+An accelerometer measures the specific force: gravity, upwards, and the acceleration of the camera.
+One reading does not tell them apart: a sideways acceleration ``a`` makes it longer by only ``a^2 /
+2 g``. But no camera accelerates one way for long. So the gyroscope rotates the readings of the last
+moments into the present axes, and their mean is the direction. Their differences, from each other
+and from g in length, give its uncertainty.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _MOST_DEVIATION = 0.5
 def gravity_seen(
     samples: ImuSamples, middle_ns: int, errors: GyroscopeErrors
 ) -> tuple[Array, float] | None:
-    """A vector (3,) along gravity in camera axes at a moment, and its deviation in rad.
+    """Return a vector (3,) along gravity in camera axes, and its deviation in rad; or None.
 
     None without an accelerometer, where the readings are too few, or where the camera accelerates
     too much.

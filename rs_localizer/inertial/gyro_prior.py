@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """A gyroscope as a prior of a frame's motion, and what frames tell of the gyroscope.
 
-The track knows what the gyroscope is off by (:mod:`.turning`) as a Gaussian, from the deviations of
-the settings on. These numbers made the prediction, so they are correlated with it: with the
-motion's prediction ``x`` of covariance ``P`` and their covariance ``C`` with it, points that tell
-``r`` and an information ``L`` of the motion move both,
+The track knows the errors of the gyroscope (:mod:`.turning`) as a Gaussian, which begins with the
+deviations of the settings. These errors are correlated with the prediction that they made. Let
+``x`` be the predicted motion, ``P`` its covariance, and ``C`` the covariance of the errors with it.
+Points that tell ``r`` and an information ``L`` of the motion move both:
 
     x by G P r,   the numbers by C^T G^T r,   G = (I + P L)^-1
 
-which is the update of the Kalman filter of all of them. What the points tell is the camera's own
-rotation: where it is farther from the prediction than once in a thousand by chance, the gyroscope
-is contradicted, and the frame is fitted without it.
+This is the update of a Kalman filter of all of them. The points tell the camera's own rotation. If
+it is farther from the prediction than once in a thousand by chance, the gyroscope is contradicted,
+and the frame is fitted without it.
 """
 
 from __future__ import annotations
@@ -187,7 +187,7 @@ class GyroscopeTrack:
         return self._unused is None
 
     def last_ns(self, samples: ImuSamples) -> int:
-        """The last moment that samples cover, by the camera's clock."""
+        """Return the last moment that samples cover, by the camera's clock."""
         return int(samples.times_ns[-1]) + round(1e9 * self.errors.time_offset) - 1
 
     def foresee(

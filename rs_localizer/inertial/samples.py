@@ -48,7 +48,7 @@ class ImuSamples:
         return len(self.times_ns)
 
     def around(self, first_ns: int, last_ns: int) -> slice | None:
-        """Samples that cover an interval, and a few on both sides; None if they do not."""
+        """Return samples that cover an interval, with a few on both sides; None if none do."""
         first = int(self.times_ns.searchsorted(first_ns, "right"))
         last = int(self.times_ns.searchsorted(last_ns))
         if first == 0 or last == len(self):
@@ -75,7 +75,7 @@ class Span(NamedTuple):
 
 @entry
 def span_of(stamps: IntArray1, start_ns: int, end_ns: int) -> Span:
-    """How readings (n >= 1), which cover an interval, lie about it."""
+    """Return how readings (n >= 1), which cover an interval, lie about it."""
     count = len(stamps)
     first, last = 0, count
     steps = np.empty(max(count - 1, 1))

@@ -23,7 +23,7 @@ class Unused:
 
 @dataclass(frozen=True, slots=True)
 class InertialSettings:
-    """What is known of the IMU before any frame.
+    """Prior of the IMU before any frame.
 
     Data sheets say 1 to 3 % of consumer gyroscopes' scales; a mount is drawn or measured to 2 deg;
     drivers stamp images and readings some milliseconds off.

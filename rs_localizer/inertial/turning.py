@@ -68,7 +68,7 @@ def _densified(times: Array, rates: Array) -> tuple[Array, Array]:
 
 @entry
 def densified(times: Array1, rates: Array2) -> tuple[Array, Array]:
-    """Times (2 n - 1,) and rates (2 n - 1,3): those given, and one between each two of them.
+    """Return times (2 n - 1,) and rates (2 n - 1,3): the given ones, and one between each two.
 
     Args:
         times: (n,) increasing, s; they need not be regular.
@@ -127,7 +127,7 @@ def densified(times: Array1, rates: Array2) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GyroscopeErrors:
-    """What a gyroscope is off by, as far as that is known."""
+    """Errors of a gyroscope, as far as they are known."""
 
     mean: Array  # (10,) rad/s, s, shares, rad
     covariance: Array  # (10,10)

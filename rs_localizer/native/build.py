@@ -177,7 +177,7 @@ def _build_level(level: str, to: Path, is_portable: bool, is_checkout: bool) -> 
 
 
 def _link(level: str, module: Path, key: str, compiler: _Compiler) -> None:
-    """Link a level's module from compiled kernels, which are made where they are missing."""
+    """Link a level's module from compiled kernels, and compile those that are missing."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = ASSEMBLED / level
         if (folder / "kernels.s").is_file():

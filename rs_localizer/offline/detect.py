@@ -229,7 +229,7 @@ class Cameras:
         self._misfit, self._fault = 0, ""  # images of another one, and what the first of them is
 
     def camera_of(self, shot: Shot, image: Image) -> Camera | Refusal:
-        """Camera of one image; refused where it is of another size than those that fit.
+        """Return the camera of one image, or refuse it if its size is another one.
 
         Raises:
             DetectError: when its camera_info cannot be used, or the first images are all of

@@ -54,7 +54,7 @@ LOOK_AHEAD = 1.0
 def imu_first(
     messages: Iterable[Item], imu: str | None, awaits: Callable[[Item], bool]
 ) -> Iterator[Item]:
-    """The messages in their order, but for those of ``imu``, which do not wait for the others.
+    """Yield the messages in their order, except those of ``imu``, which do not wait.
 
     Args:
         messages: by their times of recording.
@@ -117,12 +117,12 @@ class Topics:
         return {topic: input_named(name) for name, topic in self.of.items()}
 
     def without(self, name: str) -> Topics:
-        """The topics but for that of an input."""
+        """Return the topics without that of an input."""
         return Topics({other: topic for other, topic in self.of.items() if other != name})
 
 
 def find_topics(bag: BagReader, given: Mapping[str, str | None] | None = None) -> Topics:
-    """The topics of the inputs, given (by input; None: not given) or found.
+    """Return the topics of the inputs, given (by input; None: not given) or found.
 
     Found are those that end in the node's own names, else the only one of the type; of what is not
     necessary, only the former. An IMU is found by its type, too; several that could be meant are
@@ -154,7 +154,7 @@ def find_topics(bag: BagReader, given: Mapping[str, str | None] | None = None) -
 def find_rig_topics(
     bag: BagReader, cameras: Sequence[str], given: Mapping[str, str | None] | None = None
 ) -> Topics:
-    """The topics of a rig's cameras: those that end in ``NAME/camera_info`` and so on.
+    """Return the topics of a rig's cameras, which end in ``NAME/camera_info`` and so on.
 
     Raises:
         BagError: when a topic is given, is not there, or several could be meant.
@@ -181,7 +181,7 @@ def find_rig_topics(
 
 
 def _of_cameras(bag: BagReader, item: Input, cameras: Sequence[str]) -> dict[str, str]:
-    """The topics of an input of each camera, by ``NAME/input``."""
+    """Return the topics of an input of each camera, by ``NAME/input``."""
     chosen: dict[str, str] = {}
     for name in cameras:
         own = f"{name}/{item.topic}"
@@ -198,7 +198,7 @@ def _of_cameras(bag: BagReader, item: Input, cameras: Sequence[str]) -> dict[str
 
 
 def _choose_frames(bag: BagReader, wanted: Mapping[str, str]) -> Input:
-    """The input that is localized: what is given, else what is there by its name."""
+    """Choose the input to localize: what is given, else what is there by its name."""
     kinds = with_role(Role.FRAMES)
     given = [item for item in kinds if item.topic in wanted]
     if given:
@@ -217,7 +217,7 @@ _LOOKED_AT = 100
 
 
 def imu_topics(bag: BagReader) -> list[str]:
-    """All topics of inertial measurements; of several those with angular velocities, if any has.
+    """Return all topics of inertial messages; of several those with angular velocities.
 
     RealSense's driver publishes its accelerometer beside its gyroscope, in the same type.
     """
@@ -236,12 +236,12 @@ def _has_rates(bag: BagReader, topic: str) -> bool:
 
 
 def has_frames(bag: BagReader) -> bool:
-    """True if there is anything to localize: a cloud of any kind."""
+    """Return True if there is anything to localize: a cloud of any kind."""
     return any(set(item.types) & set(bag.topics.values()) for item in with_role(Role.FRAMES))
 
 
 def _named(bag: BagReader, item: Input) -> list[str]:
-    """Topics of the type of an input that end in its name."""
+    """Return topics of the type of an input that end in its name."""
     return sorted(
         topic
         for topic, kind in bag.topics.items()
@@ -273,19 +273,19 @@ def _find(bag: BagReader, item: Input, given: str | None) -> str:
 
 
 def tf_topics(bag: BagReader, *types: str) -> list[str]:
-    """Those of /tf_static and /tf that the recording has, as one of these types."""
+    """Return /tf_static and /tf, as far as the recording has them, as one of these types."""
     return [topic for topic in (TF_STATIC, TF) if bag.topics.get(topic) in types]
 
 
 def as_tf2(message: Any) -> Any:
-    """A message of :data:`CARRIED_TYPES`, in the type that ROS 2 has for it."""
+    """Convert a message of :data:`CARRIED_TYPES` to the type that ROS 2 has for it."""
     if message.__msgtype__ != _OLD_TF_TYPE:
         return message
     return make_message(TF_TYPE, transforms=message.transforms)
 
 
 def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> TransformTree:
-    """The transforms of the recording that the settings need; an empty tree where they need none.
+    """Return the transforms that the settings need; an empty tree if they need none.
 
     All are known from the start. A live node hears them as they come. An IMU that is not connected
     with the camera is not used.
@@ -328,7 +328,7 @@ def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> Trans
 
 
 def _frame_of(bag: BagReader, topic: str) -> str | None:
-    """Frame of the first message on a topic."""
+    """Return the frame of the first message on a topic."""
     return next((message.header.frame_id for _, _, message in bag.messages((topic,))), None)
 
 
@@ -346,7 +346,7 @@ def prepare(
     given: Mapping[str, str | None] | None = None,
     notice: Notify = unheard,
 ) -> tuple[Topics, FrameLocalizer]:
-    """Inputs of :func:`replay`: topics, and a localizer with its map.
+    """Prepare the inputs of :func:`replay`: topics, and a localizer with its map.
 
     Args:
         given: topics, as for :func:`find_topics`.
@@ -379,7 +379,7 @@ class Answer(NamedTuple):
 
 
 def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterator[Answer]:
-    """The result of every frame, as the node would have answered.
+    """Yield the result of every frame, as the node would have answered.
 
     A message that is no frame and cannot be used gives a Refusal of its own, for a reason of
     :data:`NO_FRAMES`.
@@ -413,7 +413,7 @@ def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterato
 
 
 def inlier_columns(frame: Localized, names: str) -> Array:
-    """Fields (k, len(names)) of the inliers of a frame."""
+    """Return fields (k, len(names)) of the inliers of a frame."""
     return np.stack([frame.inliers[name].astype(np.float64) for name in names], axis=1)
 
 

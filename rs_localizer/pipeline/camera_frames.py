@@ -70,7 +70,7 @@ class CameraFrames(FrameLocalizer):
         return FrameContext(self._config.readout_time_deviation, self._landmarks.error_modes)
 
     def _middle_row_ns(self, stamp_ns: int) -> int:
-        """Time at which the middle row of the image with this stamp was exposed."""
+        """Return the time at which the middle row of the image with this stamp was exposed."""
         return middle_row_ns(self._config, self._camera, stamp_ns)
 
     @property
@@ -81,7 +81,7 @@ class CameraFrames(FrameLocalizer):
         return self._camera.bearings(corners)
 
     def awaits_imu(self, stamp_ns: int, patience: float) -> bool:
-        """True if readings of the frame with this stamp may yet come within so many s."""
+        """Return True if readings of the frame with this stamp may come within so many seconds."""
         time_ns = self._middle_row_ns(stamp_ns)
         return self.imu.awaits(self._tracker, self._config, time_ns, patience)
 
@@ -199,7 +199,7 @@ class CameraFrames(FrameLocalizer):
             self._notice(notice, shutter.fault)
 
     def _published(self, cloud: Correspondences, result: Estimate | Failure) -> Localized | Refusal:
-        """A result of the body at the published moment."""
+        """Return a result of the body at the published moment."""
         if not result:
             return Refusal(result.reason, result.detail)
         if result.integrity > DOUBTFUL:
@@ -221,7 +221,7 @@ class CameraFrames(FrameLocalizer):
         return self.mounted(self._camera_result(cloud, estimate, moment, deviation))
 
     def _delayed(self, newest: Localized | Refusal, stamp_ns: int) -> Localized | Refusal | None:
-        """The result that ``output_lag`` asks for when the frame of this stamp has come.
+        """Return the result that ``output_lag`` asks for, once the frame of this stamp has come.
 
         None while the first frames wait.
         """
@@ -233,13 +233,13 @@ class CameraFrames(FrameLocalizer):
         return None if waits else self._late(found)
 
     def _late(self, found: Estimate | Failure) -> Localized | Refusal:
-        """The result of a frame that has waited."""
+        """Return the result of a frame that has waited."""
         if not found:
             return Refusal(found.reason, found.detail)
         return self._published(self._waiting[found.time_ns], found)
 
     def flush(self) -> list[Localized | Refusal]:
-        """The results that ``output_lag`` has held back: no more images will come."""
+        """Return the results of frames that still wait for others: none will come."""
         return list(map(self._late, self._tracker.flush()))
 
     @property
@@ -248,13 +248,13 @@ class CameraFrames(FrameLocalizer):
         return self._tracker.remembers_motion
 
     def snapshot(self) -> CameraFrames:
-        """What :meth:`at` knows now, for another thread while frames are localized here."""
+        """Return a copy for :meth:`at` in another thread, while frames are localized here."""
         there = copy(self)
         there._tracker = self._tracker.snapshot()
         return there
 
     def at(self, stamp_ns: int) -> Localized | Refusal | None:
-        """Pose and twist at a time of the images' clock, without inliers.
+        """Return pose and twist at a time of the images' clock, without inliers.
 
         None before the last frames, more than ``max_prediction`` after them, and where frames do
         not know how the camera moves (:attr:`predicts`).

@@ -122,7 +122,7 @@ class ImuInput:
         )
 
     def awaits(self, tracker: Tracker, config: NodeConfig, time_ns: int, patience: float) -> bool:
-        """Return True if missing readings of this exposure may come within this many seconds."""
+        """Return True if missing readings of this exposure may come within so many seconds."""
         if not self._wanted(config) or tracker.inertial is None:
             return False
         _, end_ns = _exposure(config, time_ns, tracker)

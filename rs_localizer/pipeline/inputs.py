@@ -50,7 +50,7 @@ class Role(Enum):
 
 
 def _as_it_is(message: Any) -> Any:
-    """The reader of frames: most of them are read where they are localized, or never."""
+    """Return a message unread: most frames are read where they are localized, or never."""
     return message
 
 
@@ -166,18 +166,18 @@ INPUTS = {row.topic: row for row in _ROWS}
 
 
 def input_named(name: str) -> Input:
-    """An input by its name; of a camera of a rig that is ``NAME/correspondences`` and so on."""
+    """Return an input by its name; for a rig's camera ``NAME/correspondences`` and so on."""
     return INPUTS[name.rpartition("/")[2]]
 
 
 def input_in_words(name: str) -> str:
-    """Words for a user whom an input lacks."""
+    """Describe an input to a user who lacks it."""
     camera, _, own = name.rpartition("/")
     return f"{INPUTS[own].in_words} of {camera}" if camera else INPUTS[own].in_words
 
 
 def with_role(role: Role) -> list[Input]:
-    """The inputs of a role."""
+    """Return the inputs of a role."""
     return [row for row in _ROWS if row.role == role]
 
 
@@ -186,7 +186,7 @@ _OWN = (topics.CAMERA_INFO, topics.CORRESPONDENCES, topics.KEYPOINTS)
 
 
 def inputs_of(config: NodeConfig) -> Mapping[str, Input]:
-    """All inputs by name; of cameras with names ``NAME/correspondences`` and so on."""
+    """Return all inputs by name; of cameras with names ``NAME/correspondences`` and so on."""
     if not config.of_cameras:
         return INPUTS
     rows = {item.topic: item for item in INPUTS.values() if item.topic == topics.MAP_POINTS}
@@ -197,7 +197,7 @@ def inputs_of(config: NodeConfig) -> Mapping[str, Input]:
 
 
 def _of_camera(item: Input, name: str) -> Input:
-    """An input of a camera with a name."""
+    """Return the input of a camera with a name."""
     own = replace(item, topic=f"{name}/{item.topic}", about=f"{name}: {item.about}")
     if item.topic == topics.CAMERA_INFO:
         return replace(own, use=lambda localizer, found: localizer.calibrate(found, name))
@@ -207,7 +207,7 @@ def _of_camera(item: Input, name: str) -> Input:
 def frame_localizer(
     config: NodeConfig, notice: Notify = unheard, transforms: Transforms | None = None
 ) -> FrameLocalizer:
-    """Who localizes the frames of a camera, or of a rig, by these settings.
+    """Return the localizer of frames of a camera, or of a rig, with these settings.
 
     Raises:
         ValueError: for settings that the localizer refuses.

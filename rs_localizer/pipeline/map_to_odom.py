@@ -290,7 +290,7 @@ class _Case:
         return False
 
     def _renewed(self, known: Hypothesis, found: Hypothesis, most: float) -> Hypothesis:
-        """Return a hypothesis with its newest pose, and a support of at most this many seconds."""
+        """Return a hypothesis with its newest pose, and a support of at most so many seconds."""
         since = max(1e-9 * (self.now.stamp_ns - known.near_ns), 0.0)
         support = min(known.support + min(since, _STEP), most)
         measured = found.pose, self.now, self.state.drift, self.settings.axes

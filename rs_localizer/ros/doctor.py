@@ -72,7 +72,7 @@ class Surroundings:
         return {wanted: sorted(names) for wanted, names in self._found.items()}
 
     def until(self, stopped: Callable[[], bool]) -> None:
-        """Look around until ``stopped`` says so."""
+        """Look at the surroundings until it is to stop."""
         listening: Inputs | None = None
         executor = executor_of(self._node.context)
         executor.add_node(self._node)

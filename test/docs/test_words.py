@@ -20,11 +20,11 @@ PACKAGE = pages.ROOT / "rs_localizer"
 MOST_WORDS = 30
 # Rooms of the package whose docstrings still have to be rewritten: the list may only shrink.
 EXEMPT = (
-    "estimation/", "inertial/", "pipeline/camera_frames.py", "pipeline/inputs.py",
-    "offline/replay.py",
+    "estimation/calibration.py", "estimation/left_out.py", "estimation/motion_window.py",
+    "estimation/result.py",
 )  # fmt: skip
 # Pages that still have to be rewritten.
-EXEMPT_PAGES = ("docs/estimator.md", "docs/limits.md")
+EXEMPT_PAGES: tuple[str, ...] = ()
 # What a function does, as its docstring says it first. A new verb is a word more here.
 VERBS = frozenset(
     """
@@ -34,15 +34,15 @@ VERBS = frozenset(
     Detect Divide Do Draw Drop Emit Encode End Ensure Enter Estimate Evaluate Execute Expand
     Expect Explain Extend Extract Feed Fill Filter Find Finish Fit Follow Forget Format Gather
     Give Group Handle Hold Ignore Import Initialize Insert Integrate Interpolate Interpret
-    Invert Iterate Join Judge Keep Know Learn Leave Let Limit Linearize List Listen Load
-    Localize Lock Log Look Lower Make Map Mark Match Measure Merge Minimize Move Multiply Name
-    Note Number Open Optimize Order Pack Parse Place Plan Plot Pop Predict Prepare Print Process
-    Project Propagate Publish Put Queue Raise Ransac Read Receive Reconstruct Record Reduce
-    Refine Reflect Refuse Register Remember Remove Render Repeat Replace Replay Report Request
-    Reset Resolve Restart Restore Return Rotate Round Run Sample Save Say Scale Score Search
-    Select Send Set Shift Show Shut Simulate Skip Smooth Solve Sort Split Start State Step Stop
-    Store Sum Survey Swap Take Tell Test Thin Trace Track Transform Triangularize Triangulate
-    Try Turn Undo Unpack Update Use Validate Wait Walk Warn Weigh Widen Write Yield
+    Invert Iterate Join Judge Keep Know Learn Leave Let Limit Linearize Link List Listen Load
+    Localize Lock Log Look Lower Make Map Mark Match Measure Merge Minimize Mix Move Multiply
+    Name Note Number Open Optimize Order Pack Parse Place Plan Plot Pop Predict Prepare Print
+    Process Project Propagate Publish Put Queue Raise Ransac Read Receive Reconstruct Record
+    Reduce Refine Reflect Refuse Register Remember Remove Render Repeat Replace Replay Report
+    Request Reset Resolve Restart Restore Return Rotate Round Run Sample Save Say Scale Score
+    Search Select Send Set Shift Show Shut Simulate Skip Smooth Solve Sort Split Start State
+    Step Stop Store Sum Survey Swap Take Tell Test Thin Trace Track Transform Triangularize
+    Triangulate Try Turn Undo Unpack Update Use Validate Wait Walk Warn Weigh Widen Write Yield
     """.split()
 )
 DOCUMENTED = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
@@ -82,7 +82,7 @@ def sentences(text: str) -> Iterator[str]:
             continue
         line = re.sub(r"!\[[^]]*\]\([^)]*\)", "", " ".join(block.split()))
         line = re.sub(r"\]\([^)]*\)", "]", line)
-        yield from re.split(r"(?<=[.!?:;])[\"*)\]]*\s+(?=[\"A-Za-z`*(\[])", line)
+        yield from re.split(r"(?<=[.!?:;])[\"*)\]]*\s+(?=[\"A-Za-z0-9`*(\[])", line)
 
 
 def too_long(text: str) -> list[str]:
