@@ -60,6 +60,15 @@ def test_commands_and_options_exist(page, words):
         parse_assignment(assignment)
 
 
+@pytest.mark.parametrize("page", pages.NAMES)
+def test_files_of_the_repository_in_commands_exist(page):
+    known = ("rs_localizer/", "examples/", "config/", "packaging/", "benchmarks/")
+    words = {word for line in pages.shell(page) for word in line.split() if word.startswith(known)}
+    missing = {word for word in words if not (pages.ROOT / word).exists() and "NAME" not in word}
+    # `packaging/conda` and the like are folders; assembler text is there in release branches only.
+    assert missing - {"rs_localizer/native/assembled"} == set()
+
+
 @pytest.mark.parametrize(("page", "module", "words"), _MODULES)
 def test_modules_exist(page, module, words):
     assert importlib.util.find_spec(module) is not None, page
