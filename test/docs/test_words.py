@@ -28,21 +28,16 @@ EXEMPT_PAGES: tuple[str, ...] = ()
 # What a function does, as its docstring says it first. A new verb is a word more here.
 VERBS = frozenset(
     """
-    Accept Add Adjust Answer Append Apply Ask Begin Bound Build Calibrate Call Carry Change
-    Check Choose Clear Collect Combine Compare Compile Complete Compress Compute Configure
-    Convert Copy Correct Count Create Decide Declare Decode Delay Delete Derive Describe Detach
-    Detect Divide Do Draw Drop Emit Encode End Ensure Enter Estimate Evaluate Execute Expand
-    Expect Explain Extend Extract Feed Fill Filter Find Finish Fit Follow Forget Format Gather
-    Give Group Handle Hold Ignore Import Initialize Insert Integrate Interpolate Interpret
-    Invert Iterate Join Judge Keep Know Learn Leave Let Limit Linearize Link List Listen Load
-    Localize Lock Log Look Lower Make Map Mark Match Measure Merge Minimize Mix Move Multiply
-    Name Note Number Open Optimize Order Pack Parse Place Plan Plot Pop Predict Prepare Print
-    Process Project Propagate Publish Put Queue Raise Ransac Read Receive Reconstruct Record
-    Reduce Refine Reflect Refuse Register Remember Remove Render Repeat Replace Replay Report
-    Request Reset Resolve Restart Restore Return Rotate Round Run Sample Save Say Scale Score
-    Search Select Send Set Shift Show Shut Simulate Skip Smooth Solve Sort Split Start State
-    Step Stop Store Sum Survey Swap Take Tell Test Thin Trace Track Transform Triangularize
-    Triangulate Try Turn Undo Unpack Update Use Validate Wait Walk Warn Weigh Widen Write Yield
+    Accept Add Answer Append Apply Ask Build Calibrate Call Change Check Choose Collect Compare
+    Compress Compute Configure Convert Copy Correct Count Create Decide Declare Decode Delay
+    Describe Detect Divide Do Draw Drop Encode End Estimate Expand Explain Extract Fill Filter
+    Find Finish Fit Forget Format Give Group Import Integrate Interpolate Interpret Join Judge
+    Keep Learn Let Limit Linearize Link Listen Load Localize Lock Log Look Lower Make Map Match
+    Measure Minimize Mix Move Multiply Name Note Number Open Optimize Order Pack Parse Place
+    Predict Prepare Print Project Publish Put Queue Raise Read Reconstruct Reduce Refine Reflect
+    Refuse Remember Remove Repeat Replay Return Round Run Sample Say Search Select Send Set Show
+    Smooth Solve Sort Split Start State Step Stop Sum Survey Take Tell Thin Trace Transform
+    Triangularize Turn Undo Use Validate Wait Widen Write Yield
     """.split()
 )
 DOCUMENTED = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
