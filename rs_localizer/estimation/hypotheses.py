@@ -84,7 +84,7 @@ _LARGEST_SHAKE = 0.035
 _KEPT = 0.9
 # Probability that does not count, of either kind of camera.
 _NO_PART = 1e-4
-# Of the cameras that do not show it, one in ten shakes.
+# Log odds of no vibration: one in ten of the cameras that do not show vibration has some.
 _HIDDEN_ODDS = math.log(10.0)
 # Logarithm of the evidence of an ordinary vibration against none from which it is fitted, and of
 # the ordinary spectrum, one of several, from which all are looked at.
@@ -184,7 +184,7 @@ def _of_points(
     steady = _steady(given, modes)
     groups = [steady]
     if assumed.rolling and not (declares and planar):
-        # What looks like vibration before a board that is bent is more of its bend.
+        # Apparent vibration before a bent board is more of its bend.
         groups = _with_turn(given, hypotheses, steady)
     return _mixed(given, groups)
 
@@ -308,7 +308,7 @@ def _hidden(given: _Given, steady: Posterior) -> tuple[float, Array]:
     """
     best, shared = given.best, given.frame.shared.at(steady.shared)
     own = steady.shared**2 * shared.squares
-    # What is left is as much as beside all sizes of the smooth error.
+    # The degrees of freedom left are the same as with all sizes of the smooth error.
     decided = len(shared.rows) - float(np.sum(own / (steady.noise**2 + own))) - steady.freedom
     noise = Noise(steady.noise, 1.0, decided)
     linear = linear_of(given.lines, best.inliers, True, shared.rows)
@@ -422,7 +422,8 @@ def _beside_turn(given: _Given, now: _Turning) -> _BesideTurn:
     shared = smooth_error(now.lines, now.inliers, given.bend, given.size).at(given.size)
     linear = linear_of(now.lines, now.inliers, True, shared.rows)
     still = apply_step(now.state, -MIDDLE @ now.turn)
-    # From no velocity, of which the prior of a camera at rest is so sure that rounding would show.
+    # The step starts at no velocity: the prior of a camera at rest is so sure of it that rounding
+    # would show.
     step = np.append(np.zeros(PARAMETERS), -now.turn)
     step[POSE.stop : PARAMETERS] = -still[POSE_SIZE:]
     return _BesideTurn(moved(linear, step), shared, apply_step(still, step[:PARAMETERS]), step)

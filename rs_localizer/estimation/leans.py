@@ -37,7 +37,7 @@ from rs_localizer.native import entry, inlined, kernel
 # Linearizations of a mode, at most; and the last one is where the step to the optimum leaves its
 # tangent by less than this part of the noise.
 _LOOKS, _STRAIGHT = 8, 0.1
-# How far each pair of a step (turn and move, velocities, accelerations) reaches in the first row.
+# Reach of each pair of a step (rotation and move, velocities, accelerations) in the first row.
 _REACH = (1.0, 0.5, 0.125)
 # A step that raises the cost by more than this is halved: in valleys that bend it would leave them.
 _SHORT, _HALVINGS = 1e-3, 6
@@ -49,7 +49,7 @@ _SPACING, _PIN = 1.5, 0.03
 # Neighbours are looked at of all parts up to these odds (logarithm) against the best: of a Gaussian
 # they reach beyond three deviations.
 _LEAST_PART, _MOST_PARTS = 4.0, 100
-# Where the evidence falls faster than that of the mode's Gaussian, steps shrink to this at least.
+# If the evidence falls faster than the mode's Gaussian, steps shrink at least to this.
 _LEAST_SHARE = 0.25
 # Part of the squared errors that is left at least: of a camera that shakes, noise is a tenth.
 _MOST_BETTER = 0.01
@@ -180,7 +180,7 @@ def _leans(frame: Frame, mode: Mode, terms: PriorTerms) -> tuple[Array, Array, A
     used = 2 if max(sizes[1], away[1] ** 2) > _KNOWN_LEAN**2 else 1
     axes, away = axes.T[::-1][:used].copy(), away[::-1][:used].copy()
     steps = _SPACING * np.sqrt(np.maximum(sizes[::-1][:used], TINY))
-    # By its own noise and smooth error, no mixture of sizes.
+    # The mode is evaluated with its own noise and smooth error, not with a mixture of sizes.
     alone, _, _ = mode_of(frame, mode.state, linear_at(frame, mode.state), terms)
     freedom = max(mode.freedom, 6.0)
     informations = np.zeros((count + 1, PARAMETERS, PARAMETERS))

@@ -80,7 +80,7 @@ FACTORS = np.exp(1.15 * np.arange(-2.0, 5.0))
 """Vibration is so many times the ordinary one: three in a decade, up to a degree."""
 # Deviation of the logarithm of the size of vibration: a decade.
 _DECADE = math.log(10.0)
-# Of products, what rounding may take of those of columns that the motion mimics.
+# Ridge of products, for the rounding of columns that the motion mimics.
 _RIDGE = 1e-9
 # Errors that are left at least: the linear model holds no farther.
 _LEAST_LEFT = 1e-4
@@ -88,7 +88,7 @@ _LEAST_LEFT = 1e-4
 _ROUNDING = 1e-14
 # Noise beside a smooth error is so many times that of the fit without one.
 _LEAST_PART, _MOST_PART = 0.16, 1.3
-# Of the equations, what columns leave to measure the noise with.
+# Least share of the equations that columns leave to measure the noise with.
 _LEAST_FREEDOM = 0.1
 # Logarithm of the odds below which larger sizes are not looked at, and a size has no part.
 _HOPELESS, _NO_PART = 12.0, 1e-3
@@ -334,7 +334,8 @@ def _solved(
     if size == PARAMETERS or not positive:
         return _AtOneSize(step, inverse, rest, log_determinant, 0.0, 1.0, 0.0, none), positive
     crossed = information[:PARAMETERS, PARAMETERS:].copy()
-    # By the factor: the inverse would square its rounding, and own be no longer positive.
+    # The factor is used: the inverse would square its rounding, and own would no longer be
+    # positive.
     white = (half * scale) @ crossed
     pulled = -((half * scale).T @ white)
     own = information[PARAMETERS:, PARAMETERS:] - white.T @ white
@@ -422,7 +423,7 @@ def _over_turns(
         noise's variance is left; weights (s,f).
     """
     size, (spectra, factors) = len(along), prior.odds.shape
-    # With the errors as one column more the factor has all that is asked for.
+    # With the errors as one more column the factor holds all results.
     wholes, weights = (
         np.empty((spectra * factors, size, size + 1)),
         np.full((spectra, factors), -np.inf),

@@ -127,7 +127,7 @@ def _unshaken(motion: Numbers, shake: Array2, joint: Array2) -> tuple[Numbers, A
         place = PARAMETERS + 3 * k
         add_block(jacobian, 0, place, -values[k], unit)
         add_block(jacobian, 6, place, -slopes[k], unit)
-    # As if turned back in its own axes: exp(-[-turn]x) R.
+    # The rotation is undone in its own axes: exp(-[-turn]x) R.
     turned = so3.exp(turn)
     beside = (
         turned @ rotation, turned @ translation, angular - rate, linear.copy(), change.copy(),

@@ -275,7 +275,7 @@ class Observations:
 # More points than this only take time.
 MOST_POINTS = 2500
 NEAREST = 1e-6  # m; points nearer than this would make any map useless
-# What fewer points see of it is lost in their noise, and takes time.
+# With fewer points the difference is lost in their noise, and takes time.
 _MANY = 300
 # Errors beyond which (px) the motion says nothing of where a point ought to be.
 _NEAR = 10.0

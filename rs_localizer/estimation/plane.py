@@ -18,7 +18,7 @@ from rs_localizer.native import entry
 
 # Points whose depth relief is a smaller part than this of their narrower extent are a plane.
 _PLANE = 0.1
-# What leans by less (rad) faces the camera.
+# A plane that leans by less (rad) faces the camera.
 _LEAST_LEAN = 0.01
 
 

@@ -34,7 +34,7 @@ _ITERATIONS = 50
 _FIRST, _LATER = 1e-2, 1e-4
 # A truncation that truncates nothing, px.
 _NO_SCALE = 1e6
-# Of the information matrix scaled to a unit diagonal.
+# Least eigenvalue of an information matrix scaled to a unit diagonal.
 LEAST_EIGENVALUE = 1e-11
 _NOISE_ROUNDS = 20
 
@@ -161,7 +161,8 @@ def best_motion(
         start: state (24,).
         threshold: px, least gate for inliers.
     """
-    # From the wide side: a start that fits few points well would see little noise and keep few.
+    # The gate closes from the wide side: a start that fits few points well would see little noise
+    # and keep few.
     state, gate, noise, freedom = start, WIDEST_GATE * threshold, EXPECTED_NOISE * threshold, 0.0
     errors = squared_errors(data, count, state)
     weights = np.empty(count)

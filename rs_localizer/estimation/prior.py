@@ -35,9 +35,9 @@ from rs_localizer.core.state import (
 from rs_localizer.native import entry, inlined, kernel
 from rs_localizer.solvers.table import Solver
 
-# What rounding may take of an orthonormal matrix, or of a symmetric one of a unit diagonal.
+# Rounding error of an orthonormal matrix, or of a symmetric one with a unit diagonal.
 _ROUNDING = 1e-6
-# Of a covariance scaled to a unit diagonal: what is less is rounding.
+# Least eigenvalue of a covariance scaled to a unit diagonal; smaller ones are rounding.
 _LEAST_EIGENVALUE = 1e-12
 _FAULTS = ("", "finite where its diagonal is", "symmetric", "positive definite")
 
@@ -130,7 +130,7 @@ def _is_positive(matrix: Array, scale: Array) -> bool:
     return True
 
 
-# Of a measurement; so known, a velocity is held at its mean whatever the points say.
+# Least deviation of a measurement; with it a velocity is held at its mean whatever the points say.
 _LEAST_DEVIATION = 1e-9
 
 
@@ -198,7 +198,7 @@ def state_in(motion: Motion, centre: Array) -> Array:
     )  # fmt: skip
 
 
-# Of the turn's variance, for the axis about which it may not turn.
+# Ridge, a share of the rotation's variance, for an axis about which it may not rotate.
 _RIDGE = 1e-9
 # A tenth of the speed goes with the accelerations of the whole. If any did, orientations of the
 # first row under one sine would be off by 3 % more (benchmarks.frames sine, 16 frames).
@@ -543,7 +543,8 @@ def _add_gravity(
     return cost
 
 
-# Where the readout time is unknown, that of a slow camera: its motion per readout is the largest.
+# Readout time (s) that is assumed if it is unknown: a slow camera's, whose motion per readout is
+# the largest.
 _UNKNOWN_READOUT_TIME = 0.03
 
 

@@ -44,7 +44,7 @@ def generator(seed: int) -> Random:
 # A sample whose rows lie closer together than this part of all rows hardly sees the motion.
 _LEAST_ROW_SPREAD = 0.25
 _MOST_REDRAWS = 8
-# After so many samples a ranked pool is drawn from as a whole (T_N of the PROSAC paper).
+# Number of samples after which a ranked pool is drawn from as a whole (T_N of the PROSAC paper).
 _RANKED_HORIZON = 200_000
 
 
@@ -183,7 +183,7 @@ def _draw_block(
         first, begin = last, pools.ends[k]
 
 
-# Of local optimization, at the last scale.
+# Iterations of local optimization at the last scale.
 _ITERATIONS = 3
 # Steps of a descent: at its first scale, where it has far to go, and at each of the others.
 _FIRST_STEPS, _STEPS, _RATIO = 20, 3, 0.6
@@ -287,7 +287,7 @@ def descend(
     return state, truncated_cost(data, state, last_scale, np.inf)
 
 
-# Of every block this many hypotheses are optimized: a six-point model of inliers alone is often
+# The best two hypotheses of every block are optimized: a six-point model of inliers alone is often
 # not the first in a block, because noise makes it miss most of the other inliers.
 _KEEP = 2
 

@@ -31,7 +31,8 @@ TINY = 1e-300
 """What is divided by where nothing is."""
 # Pivots of a matrix of unit diagonal below this are rounding errors.
 _SINGULAR = 1e-15
-# More damping halts in the flat valleys of fast planes, less loses planes that face the camera.
+# More damping halts in the flat valleys of fast planes; less damping loses planes that face the
+# camera.
 _ANNEALING_DAMPING, _ANNEALING_RATIO = 1e-4, 0.6
 
 
@@ -162,7 +163,7 @@ def refine(
             trial = apply_step(state, step)
             converged = gain < tolerance * noise * noise
             if converged and damping == 0.0:
-                # So near the optimum a look at where it leads would tell nothing new.
+                # So near the optimum an evaluation at the new state would change nothing.
                 return trial, information, cost - gain, True
             trial_cost = _posterior(
                 data, trial, scale, softness, prior, noise, looks,
@@ -170,7 +171,7 @@ def refine(
             )  # fmt: skip
             accepted = trial_cost <= cost
             if accepted:
-                # As far as the gain is the predicted one, the next step may be longer.
+                # If the gain is the predicted one, the next step may be longer.
                 held = 2.0 * (cost - trial_cost) / max(gain + predicted, TINY) - 1.0
                 damping *= max(1.0 - held**3, _LEAST_KEPT)
                 damping = 0.0 if damping < _LEAST_DAMPING else damping

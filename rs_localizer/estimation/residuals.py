@@ -42,8 +42,8 @@ UNIFORM_SIZE = STATE_SIZE + 3  # state, squared scale, its inverse, softness
 
 # Terms of the power series; exact to double precision up to a turn of 90 degrees per half readout.
 _SERIES_TERMS = 10
-# Where the image point nearly keeps pace with the rows, no row or any row sees it: such a motion
-# explains whatever was measured, and explains nothing.
+# If the image point nearly keeps pace with the rows, no row or any row sees it: such a motion would
+# explain every measurement.
 _LEAST_PACE = 0.1
 # The second look is taken no farther away than this, in row time.
 _FARTHEST_LOOK = 0.1
@@ -258,7 +258,7 @@ def still_cost(values: Sequence[Lanes]) -> Any:
     return values[WEIGHT] * select((z > 0.0) & (squared < scale), squared, scale)
 
 
-# So many blocks at a time stay in the fast caches.
+# Blocks that stay in the fast caches at a time.
 _CHUNK = 32
 
 
@@ -275,15 +275,15 @@ def _tiles(parameters: int) -> list[list[tuple[int, int]]]:
     return [_tile(groups[a], groups[b]) for a in range(len(groups)) for b in range(a + 1)]
 
 
-# What a point gives to the normal equations: two rows of the weighted Jacobian, each with its
+# Contribution of a point to the normal equations: two rows of the weighted Jacobian, each with its
 # weighted error as the last column, and the cost. With one look the 12 parameters of a search.
 _ROWS_SIZE = 2 * (MOTION_PARAMETERS + 1) + 1
 _CLOSER_ROWS_SIZE = 2 * (PARAMETERS + 1) + 1
 _TILES, _CLOSER_TILES = _tiles(MOTION_PARAMETERS), _tiles(PARAMETERS)
 _PAIRS = np.array([pair for tile in _TILES for pair in tile])
 _CLOSER_PAIRS = np.array([pair for tile in _CLOSER_TILES for pair in tile])
-# What :func:`linearized` says of a point: twice the error, its derivatives by the parameters and by
-# a turn at its row; where on the image it is seen, and the row time.
+# Values of :func:`linearized` for a point: twice the error, its derivatives by the parameters and
+# by a rotation at its row; then its place on the image, and the row time.
 _LINE = 1 + PARAMETERS + 3
 
 

@@ -44,7 +44,7 @@ _BLOCK = 64
 _FEW_SAMPLES = 384
 # A start leads nowhere if its own motion fits less than this part of the points near it.
 _AGREEING = 0.5
-# Of points that are left out: enough to find three inliers among those of which two fifths are.
+# Samples of left-out points: enough to find three inliers if two fifths are inliers.
 _START_SAMPLES = 96
 
 

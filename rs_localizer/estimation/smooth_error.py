@@ -23,8 +23,8 @@ DEGREE = 3
 # Expected size of each degree: printers stretch paper, lenses bend at the rim; the mean square
 # over the image of a field of size 1 that has no depth is 1.
 _DEGREE_SIZES = (1.0, 1.0, 0.5, 0.25)
-# So much smaller for each power of the depth: a map is off by more where it is near, a lens not.
-# With 1 a phone's lens is taken for its map, with 0.5 fewer regions hold in a room that is bent.
+# Factor for each power of the depth: a map has larger errors nearby, a lens does not. With 1 a
+# phone's lens is taken for its map; with 0.5 fewer regions hold in a room that is bent.
 _DEPTH = 0.7
 _POWERS = np.array([
     (i, j, degree - i - j)
@@ -114,7 +114,7 @@ def _places_of(by_motion: Array, rays: Array) -> Array:
             for axis in range(3):
                 turn += by_motion[i, side, TURN.start + axis] ** 2
                 move += by_motion[i, side, MOVE.start + axis] ** 2
-        # What a turn moves has no depth.
+        # The displacement by a rotation does not depend on the depth.
         flat = 2.0 * (x * y) ** 2 + (1.0 + x * x) ** 2 + (1.0 + y * y) ** 2 + x * x + y * y
         depth = math.sqrt(turn / flat * (2.0 + x * x + y * y) / max(move, 1e-300))
         places[i, 0], places[i, 1], places[i, 2] = x, y, depth

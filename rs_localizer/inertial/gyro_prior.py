@@ -61,11 +61,12 @@ from rs_localizer.inertial.turning import PARAMETERS as ERRORS
 _BIAS_DEVIATION = math.radians(3.0)
 # Clocks drift apart, s/sqrt(s).
 _DELAY_WALK = 5e-6
-# Of a step: what a gyroscope contradicts, and the 99.9 % quantile of chi-squared of six numbers.
+# Parts of a step that a gyroscope contradicts, and the 99.9 % quantile of chi-squared of six
+# numbers.
 _SEEN = np.r_[TURN, ANGULAR]
 _MOST_DISTANCE = 22.46
-# Of a prediction's covariance: so much less may the points know of a motion (a share), so that
-# rounding is none.
+# Least share of a prediction's covariance by which points know a motion better, so that it is no
+# rounding.
 _LEAST_GAIN = 1e-6
 # If so many of the last frames contradict a gyroscope, that is no chance, and it has changed: what
 # it is off by is learned anew.
@@ -83,7 +84,7 @@ _PEAK = 2.0
 # s: over which rates have changed as they will.
 _LATELY = 0.1
 _TURNING = np.r_[ANGULAR, ANGULAR_ACCELERATION]
-# Of a pose that nothing predicts, rad^2 and m^2.
+# Variances of a pose that nothing predicts, rad^2 and m^2.
 _ANYWHERE = 1e4
 
 
@@ -300,7 +301,7 @@ class GyroscopeTrack:
         expected = gained[seen] + _LEAST_GAIN * spread[seen]
         far = float(step[_SEEN] @ np.linalg.solve(expected, step[_SEEN])) / _MOST_DISTANCE
         far = max(far, _swung(found, prediction.rotation) / _MOST_SWING)
-        # What is too far counts as much as what is just near enough.
+        # A prediction that is too far off counts as much as one at the limit.
         self._learn(foreseen, information / max(far, 1.0), pull / max(far, 1.0))
         agrees = bool(far <= 1.0)
         self._contradictions.append(not agrees)

@@ -39,23 +39,24 @@ BIAS, DELAY, SCALE, MOUNT = slice(0, 3), slice(3, 4), slice(4, 7), slice(7, 10)
 BETWEEN, RATE, CHANGE = slice(0, 3), slice(3, 6), slice(6, 9)
 """Of what it says: the turn since the last frame, the rate within this one, and its change."""
 
-# What stamps of single frames and samples are off by beside a constant delay, at best, s.
+# Deviation (s) of stamps of single frames and samples beside a constant delay, at best.
 _JITTER = 4e-5
-# What is left of a turn beside scales and mount: axes that are not square, by data sheets.
+# Error of a rotation beside scales and mount: axes that are not square, by data sheets.
 _SKEW = 0.003
 # The integral of white noise is a random walk. The least-squares parabola of one over an interval
 # of length 1 has a slope and a curvature of these variances (by its Legendre coefficients).
 _WALK_SLOPE, _WALK_CURVATURE = 6.0 / 5.0, 120.0 / 7.0
 # Squared mean and slope of a line through a vibration, to its mean square; at most.
 _WAVE_MEAN, _WAVE_SLOPE = 2.0, 120.0
-# Of the samples' period: shifts by less leave all that samples show.
+# Share of the samples' period: shifts by less leave all that samples show.
 _SHORT = 0.3
 # s of a shift that rounding does not decide; and of squared rates.
 _LEAST_SHIFT, _TINY = 1e-6, 1e-30
 
 # End of the spectrum, as a part of the sample rate, and noise beside it (variance).
 _BAND, _NOISE = 0.4, 1e-5
-# More samples than this in an exposure are dense enough, and solving for them would take time.
+# With more samples than this in an exposure they are dense enough, and solving for them would take
+# time.
 _MOST = 64
 
 
@@ -84,7 +85,7 @@ def densified(times: Array1, rates: Array2) -> tuple[Array, Array]:
     # The sine of a difference by those of both: n of them, not n^2.
     sines, cosines = np.sin(width * times), np.cos(width * times)
     factor = np.empty((count, count))
-    # Nothing is supposed of the mean.
+    # The mean has no prior.
     mean = np.zeros(3)
     for i in range(count):
         for axis in range(3):
@@ -258,7 +259,7 @@ def _averaged(
     weights = np.gradient(times) * np.exp(-0.5 * ((times[:, None] - times) / deviation) ** 2)
     weights /= weights.sum(axis=1)[:, None]
     averaged = weights @ rates
-    # Beside what goes with the shift to first order.
+    # The part that is linear in the shift is left out.
     along = deviation * np.gradient(averaged, times, axis=0)
     spread = (weights @ rates**2 - averaged**2 - along**2)[near]
     rough = np.maximum(spread.mean(axis=0), 0.0)
