@@ -28,16 +28,16 @@ EXEMPT_PAGES: tuple[str, ...] = ()
 # What a function does, as its docstring says it first. A new verb is a word more here.
 VERBS = frozenset(
     """
-    Accept Add Answer Append Apply Ask Build Calibrate Call Change Check Choose Collect Compare
-    Compress Compute Configure Convert Copy Correct Count Create Decide Declare Decode Delay
-    Describe Detect Divide Do Draw Drop Encode End Estimate Expand Explain Extract Fill Filter
-    Find Finish Fit Forget Format Give Group Import Integrate Interpolate Interpret Join Judge
-    Keep Learn Let Limit Linearize Link Listen Load Localize Lock Log Look Lower Make Map Match
-    Measure Minimize Mix Move Multiply Name Note Number Open Optimize Order Pack Parse Place
-    Predict Prepare Print Project Publish Put Queue Raise Read Reconstruct Reduce Refine Reflect
-    Refuse Remember Remove Repeat Replay Return Round Run Sample Say Search Select Send Set Show
-    Smooth Solve Sort Split Start State Step Stop Sum Survey Take Tell Thin Trace Transform
-    Triangularize Turn Undo Use Validate Wait Widen Write Yield
+    Accept Add Answer Append Apply Ask Average Begin Build Calibrate Call Change Check Choose
+    Collect Compare Compress Compute Configure Convert Copy Correct Count Create Decide Declare
+    Decode Delay Describe Detect Divide Do Draw Drop Encode End Estimate Expand Explain Extract
+    Fill Filter Find Finish Fit Forget Format Give Group Import Integrate Interpolate Interpret
+    Join Judge Keep Learn Let Limit Linearize Link Listen Load Localize Lock Log Look Lower Make
+    Map Match Measure Minimize Mix Move Multiply Name Note Number Open Optimize Order Pack Parse
+    Place Predict Prepare Print Project Publish Put Queue Raise Read Reconstruct Reduce Refine
+    Reflect Refuse Remember Remove Repeat Replay Return Round Run Sample Say Search Select Send
+    Set Show Smooth Solve Sort Split Start State Step Stop Sum Survey Take Tell Thin Trace
+    Transform Triangularize Turn Undo Use Validate Wait Widen Write Yield
     """.split()
 )
 DOCUMENTED = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
