@@ -23,8 +23,8 @@ by_rosdoc2 = "confpy_succeeded" in globals()  # which runs this file inside its 
 # The pages, in the order of the site's contents; rosdoc2 makes a front page of its own.
 PAGES = {
     "Start": "concepts install phone camera common_cameras cameras/index",
-    "Use": "node robot reasons detector features imu rigs recordings calibration mapping "
-    "map_build maps simulation integrations examples library policy build_farm",
+    "Use": "node robot reasons wrong_poses detector features imu rigs recordings calibration "
+    "mapping map_build maps simulation integrations examples library policy build_farm",
     "Understand": "limits solvers estimator honesty benchmarks architecture api",
 }
 OTHERS = (

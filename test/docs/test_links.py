@@ -53,6 +53,11 @@ def test_every_page_can_be_reached_from_the_readme():
     assert reached == set(pages.NAMES)
 
 
+def test_the_site_has_every_page():
+    listed = set(re.findall(r"\w+", (pages.ROOT / "docs/conf.py").read_text(encoding="utf-8")))
+    assert {path.stem for path in (pages.ROOT / "docs").glob("*.md")} <= listed
+
+
 def test_modules_that_the_architecture_names_exist():
     modules = {n for n in pages.names_in(pages.prose("docs/architecture.md")) if n.endswith(".py")}
     assert len(modules) > 20
