@@ -9,9 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, IntArray, IntArray1
-from rs_localizer.core.blocks import median
-from rs_localizer.native import entry
+from rs_localizer.core.arrays import Array, IntArray
 
 MARGIN = 4
 """Samples before and after an interval that the spline through its samples wants to have: what
@@ -73,30 +71,16 @@ class Span(NamedTuple):
     gap: float  # the longest step in the interval, if that is a gap; else 0
 
 
-@entry
-def span_of(stamps: IntArray1, start_ns: int, end_ns: int) -> Span:
+def span_of(stamps: IntArray, start_ns: int, end_ns: int) -> Span:
     """Return how readings (n >= 1), which cover an interval, lie about it."""
-    count = len(stamps)
-    first, last = 0, count
-    steps = np.empty(max(count - 1, 1))
-    steps[0] = 0.0
-    closest = np.inf
-    for i in range(count):
-        if stamps[i] <= start_ns:
-            first = i
-        if i and stamps[i] >= end_ns and last == count:
-            last = i + 1
-        if i:
-            steps[i - 1] = stamps[i] - stamps[i - 1]
-            closest = min(closest, steps[i - 1])
-    period = median(steps)
-    begin, end, gap = 0, count, 0.0
-    for i in range(1, count):
-        if steps[i - 1] > _MOST_PERIODS * period:
-            if i <= first:
-                begin = i
-            elif i < last:
-                gap = max(gap, steps[i - 1])
-            else:
-                end = min(end, i)
-    return Span(first, last, begin, end, period, closest, gap)
+    count, steps = len(stamps), np.diff(stamps)
+    period, closest = (float(np.median(steps)), float(steps.min())) if count > 1 else (0.0, np.inf)
+    first = max(int(stamps.searchsorted(start_ns, "right")) - 1, 0)
+    last = min(int(stamps[1:].searchsorted(end_ns)) + 2, count)
+    gaps = np.flatnonzero(steps > _MOST_PERIODS * period) + 1  # places of the readings behind them
+    inside = gaps[(gaps > first) & (gaps < last)]
+    return Span(
+        first, last, int(gaps[gaps <= first].max(initial=0)),
+        int(gaps[gaps >= last].min(initial=count)), period, closest,
+        float(steps[inside - 1].max(initial=0)),
+    )  # fmt: skip

@@ -311,7 +311,8 @@ def summary(tally: Tally, config: NodeConfig, timed: bool = True) -> list[str]:
         if imu.used and imu.status is not None and np.isfinite(imu.time_offset):
             bias = np.linalg.norm(np.degrees(imu.status.bias))
             rows.append(("  bias of the gyroscope (deg/s)", f"{bias:.2f}"))
-            rows.append(("  time offset of the IMU (ms)", f"{1e3 * imu.time_offset:.2f}"))
+            offset, deviation = 1e3 * imu.time_offset, 1e3 * imu.status.time_offset_deviation
+            rows.append(("  time offset of the IMU (ms)", f"{offset:.2f} +- {deviation:.2f}"))
             if imu.status.oddity:
                 rows.append(("  said by the camera's rotation:", imu.status.oddity))
     if timed:

@@ -247,7 +247,7 @@ class ImuInput:
         oddity = "" if self._status is None else self._status.oddity
         self._odd = self._odd + 1 if oddity else 0
         if self._odd == _LONG:
-            self._notice(ImuReason.DISAGREES, f"the gyroscope is allowed for as it is: {oddity}")
+            self._notice(ImuReason.DISAGREES, f"the gyroscope is used and corrected: {oddity}")
         if unused is None:
             self._in_a_row.clear()
             self._reported = None
