@@ -6,9 +6,10 @@ python -m benchmarks.kinds --seeds 1 2
 
 Each row is one kind of fault: two recordings of a hand-held camera before landmarks that stay where
 they are, through the code that node and ``replay`` share. Nothing of the package makes the frames.
-Columns: frames, published, median errors of the pose at the stamp and of the angular velocity, how
-many of the published poses and of the known twists lie in their 95 % regions, how many are beyond
-five standard deviations in either, and what is said (the notices, and reasons of refusals).
+Columns: how many of 60 frames are published, median errors of the pose at the stamp and of the
+angular velocity, how many of the published poses and of the known twists lie in their 95 % regions,
+how many are beyond five standard deviations in either, and what is said (notices, and reasons of
+refusals).
 """
 
 from __future__ import annotations
@@ -35,12 +36,14 @@ from rs_localizer.config import CalibrationErrors, NodeConfig
 from rs_localizer.io.camera_info import Calibration
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.outputs import Localized
-from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.camera_frames import CameraFrames
 
 _RECORDINGS, _LENGTH, _NOISE = 2, 30, 0.1  # frames each, px
 _START_NS = 10**15
 _SIZE = (640, 480)
 _READOUT = 0.03
+# What frames say that see too little of a map.
+_NO_WORD = ("too_few_points", "uncertain")
 _INSIDE = float(chi2.ppf(0.95, 6))
 _FIVE = float(chi2.isf(2.0 * norm.sf(5.0), 6))
 _WELL = CalibrationErrors(
@@ -50,6 +53,7 @@ _WELL = CalibrationErrors(
 _ORDINARY = NodeConfig()
 
 _LENS = Camera(focal=500.0, readout_time=_READOUT)
+_MILD = Camera(focal=500.0, readout_time=_READOUT, distortion=(-0.02, 0.005, 0.0, 0.0, 0.0))
 _PLAIN = Camera(focal=500.0, readout_time=_READOUT, distortion=(0.0,) * 5)
 
 
@@ -192,7 +196,7 @@ def _kinds() -> list[Kind]:
         Kind("right: wall", _wall, right),
         Kind("right: board", _board, right),
         Kind("right: room", _room, right),
-        Kind("right: corner, well calibrated", _corner, right, camera=_LENS, settings=well),
+        Kind("right: corner, good lens", _corner, right, camera=_LENS, settings=well),
         Kind("squeezed by 0.7 %, corner", _corner, partial(squeezed, 1.0, 0.993)),
         Kind("squeezed by 2 %, corner", _corner, partial(squeezed, 1.0, 0.98)),
         Kind("stretched by 3 %, room", _room, partial(squeezed, 1.0, 1.03)),
@@ -205,12 +209,13 @@ def _kinds() -> list[Kind]:
         Kind("f of 0.6 times, board, single", _board, partial(other_lens, 0.6), False),
         Kind("rectified, corner", _corner, partial(rectified, 1.0), camera=_LENS, settings=well),
         Kind("rectified, usual deviations", _corner, partial(rectified, 1.0), camera=_LENS),
-        Kind("half rectified, corner", _corner, partial(rectified, 0.5), camera=_LENS,
+        Kind("mild lens, rectified, corner", _corner, partial(rectified, 1.0), camera=_MILD,
              settings=well),
+        Kind("mild lens, rectified, usual", _corner, partial(rectified, 1.0), camera=_MILD),
         Kind("stabilised, corner", _corner, partial(stabilised, 0.7, 1.0), settings=well),
-        Kind("stabilised, zoomed by 10 %, room", _room, partial(stabilised, 0.7, 1.1)),
-        Kind("half of the map moved 1 cm, corner", _corner, partial(half_moved, 0.01)),
-        Kind("half of the map moved 3 cm, room", _room, partial(half_moved, 0.03)),
+        Kind("stabilised and zoomed, room", _room, partial(stabilised, 0.7, 1.1)),
+        Kind("half the map moved 1 cm, corner", _corner, partial(half_moved, 0.01)),
+        Kind("half the map moved 3 cm, room", _room, partial(half_moved, 0.03)),
         Kind("map stretched by 1 %, corner", _corner, partial(stretched, 0.01)),
         Kind("map stretched by 1 %, wall", _wall, partial(stretched, 0.01)),
     ]  # fmt: skip
@@ -250,19 +255,23 @@ class _Tally:
 
     def row(self, name: str) -> tuple[str, ...]:
         errors = np.array(self.errors).reshape(-1, 3)
-        cells = ["-"] * 3
-        for k in range(3):
-            if np.isfinite(errors[:, k]).any():
-                cells[k] = f"{np.nanmedian(errors[:, k]):.2g}"
+        cells = [
+            f"{float(f'{np.nanmedian(each):.2g}'):g}" if np.isfinite(each).any() else "-"
+            for each in errors.T
+        ]
         inside = [
             f"{100 * hits / count:.0f}" if count else "-"
             for hits, count in zip(self.inside, (self.published, self.twists), strict=True)
         ]
-        said = ", ".join(f"{name}" for name, _ in self.said.most_common(3))
+        said = [name for name, _ in self.said.most_common() if name not in _NO_WORD]
         return (
-            name, f"{self.published} of {self.frames}", " ".join(cells), " ".join(inside),
-            f"{self.beyond}", said or "nothing",
-        )  # fmt: skip
+            name,
+            f"{self.published}",
+            *cells,
+            " ".join(inside),
+            f"{self.beyond}",
+            ", ".join(said[:3]) or "nothing",
+        )
 
 
 def _squared(off: Array, covariance: Array) -> float:
@@ -312,7 +321,7 @@ def _localize(
     kind: Kind, told: Seen, true: States, rng: np.random.Generator, tally: _Tally
 ) -> None:
     config = replace(kind.settings, readout_time=kind.camera.readout_time, tracking=kind.tracked)
-    localizer = FrameLocalizer(config, tally.hear)
+    localizer = CameraFrames(config, tally.hear)
     K = tuple(map(float, told.K.ravel()))
     localizer.calibrate(Calibration("camera", *_SIZE, K, told.D, "plumb_bob", (1, 1), None))
     shown = visible(kind.camera, told.pixels)
@@ -330,7 +339,7 @@ def _localize(
         tally.frames += 1
         if found:
             tally.add(found, true, frame)
-        else:
+        elif found is not None:
             tally.hear(found.reason, found.detail)
 
 
@@ -351,7 +360,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if options.say:
                 for name, text in tally.texts.items():
                     sys.stderr.write(f"    {name} {tally.said[name]}: {text}\n")
-    heads = ("kind", "published", "mm deg deg/s", "poses, twists inside", "beyond 5", "said")
+    heads = ("kind", "published", "mm", "deg", "deg/s", "inside %", ">5", "said")
     print(Table(heads, rows).text())
     return 0
 

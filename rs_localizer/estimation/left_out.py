@@ -143,6 +143,8 @@ def left_out(
             return LeftOut(failure)
     if second is None:
         return LeftOut(notice=_rough(observed, posterior) if wide else "")
+    if apart := _cameras_apart(observed, inliers, second, threshold):
+        return LeftOut(Failure(Reason.MODEL_ERROR, apart))
     size = int(np.count_nonzero(second.chosen))
     where = _side(observed, inliers, second.chosen)
     step = step_between(posterior.state, second.state)
@@ -164,6 +166,29 @@ def left_out(
 def _is_off_centre(observed: Observed) -> bool:
     """Whether K's principal point alone speaks for another image."""
     return off_centre(observed.sighted.exposure.cameras[0])
+
+
+def _cameras_apart(observed: Observed, inliers: BoolArray, second: _Group, threshold: float) -> str:
+    """Sentence on a camera of a rig that has a motion of its own; empty: that is not so.
+
+    A body before it moves otherwise than most of its points. Where all of them do, no image tells
+    which camera is where it is said to be, and no frame before this one does.
+    """
+    exposure = observed.sighted.exposure
+    if exposure.alone:
+        return ""
+    of = np.array([side.place for side in exposure.sides])[observed.observations.camera]
+    counts = np.bincount(of[second.chosen], minlength=len(exposure.names))
+    place = int(np.argmax(counts))
+    fitting = second.squared_errors[of == place] < (WIDEST_GATE * threshold) ** 2
+    if counts[place] < (1.0 - _ELSE) * counts.sum() or np.count_nonzero(
+        fitting
+    ) <= np.count_nonzero(inliers[of == place]):
+        return ""
+    return (
+        f"the points of {exposure.names[place]} have a motion of their own: its extrinsics or its "
+        "clock are others (rs_localizer calibrate --rig)"
+    )
 
 
 def _rough(observed: Observed, posterior: Posterior) -> str:
