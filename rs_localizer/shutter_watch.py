@@ -332,24 +332,20 @@ class ShutterWatch:
 
     @property
     def squeeze(self) -> float:
-        """Deviation of fy over fx from the image's, a share: as declared, and as frames show."""
-        if self._camera is None or self._aspect_ratio == 0.0:
-            return self._aspect_ratio
+        """By how much fy over fx is surely off, a share: rows of all frames are so by as much."""
+        if self._camera is None:
+            return 0.0
         squeeze, deviation = self._shown_squeeze
-        # What is shown beyond two deviations, nobody declared.
-        declared = max(self._aspect_ratio**2, squeeze**2 - 4.0 * deviation**2)
-        shown = declared / (declared + deviation**2)
-        return math.hypot(shown * squeeze, math.sqrt(shown) * deviation)
+        return math.sqrt(max(squeeze**2 - 4.0 * deviation**2, 0.0))
 
     @property
     def _shown_squeeze(self) -> tuple[float, float]:
         """How much larger fy over fx is than K's, and the deviation of that."""
-        return float(self._mean[14]), math.sqrt(self._covariance[14, 14])
+        return float(self._mean[14]), _LEANS * math.sqrt(self._covariance[14, 14])
 
     def _squeezed(self) -> str:
         """How frames contradict fx and fy, in one sentence, if they do."""
         squeeze, deviation = self._shown_squeeze
-        deviation *= _LEANS
         if abs(squeeze) <= _SQUEEZED * math.hypot(deviation, self._aspect_ratio):
             return ""
         return (
