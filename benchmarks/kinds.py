@@ -204,7 +204,7 @@ def _kinds() -> list[Kind]:
         Kind("squeezed across by 5 %, corner", _corner, partial(squeezed, 0.95, 1.0)),
         Kind("K of twice the size, wall", _wall, partial(other_resolution, 2.0)),
         Kind("K of 1.5 times the size, wall", _wall, partial(other_resolution, 1.5)),
-        Kind("K of half the size, wall, single", _wall, partial(other_resolution, 0.5), False),
+        Kind("K of half the size, single", _wall, partial(other_resolution, 0.5), False),
         Kind("f of 1.9 times, board", _board, partial(other_lens, 1.9)),
         Kind("f of 0.6 times, board, single", _board, partial(other_lens, 0.6), False),
         Kind("rectified, corner", _corner, partial(rectified, 1.0), camera=_LENS, settings=well),
@@ -214,8 +214,8 @@ def _kinds() -> list[Kind]:
         Kind("mild lens, rectified, usual", _corner, partial(rectified, 1.0), camera=_MILD),
         Kind("stabilised, corner", _corner, partial(stabilised, 0.7, 1.0), settings=well),
         Kind("stabilised and zoomed, room", _room, partial(stabilised, 0.7, 1.1)),
-        Kind("half the map moved 1 cm, corner", _corner, partial(half_moved, 0.01)),
-        Kind("half the map moved 3 cm, room", _room, partial(half_moved, 0.03)),
+        Kind("half map moved 1 cm, corner", _corner, partial(half_moved, 0.01)),
+        Kind("half map moved 3 cm, room", _room, partial(half_moved, 0.03)),
         Kind("map stretched by 1 %, corner", _corner, partial(stretched, 0.01)),
         Kind("map stretched by 1 %, wall", _wall, partial(stretched, 0.01)),
     ]  # fmt: skip
@@ -270,7 +270,7 @@ class _Tally:
             *cells,
             " ".join(inside),
             f"{self.beyond}",
-            ", ".join(said[:3]) or "nothing",
+            ", ".join(said[:2]) or "nothing",
         )
 
 
@@ -360,7 +360,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if options.say:
                 for name, text in tally.texts.items():
                     sys.stderr.write(f"    {name} {tally.said[name]}: {text}\n")
-    heads = ("kind", "published", "mm", "deg", "deg/s", "inside %", ">5", "said")
+    heads = ("kind", "of 60", "mm", "deg", "deg/s", "inside %", ">5", "said")
     print(Table(heads, rows).text())
     return 0
 

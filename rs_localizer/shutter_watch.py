@@ -344,7 +344,7 @@ class ShutterWatch:
         return float(self._mean[14]), _LEANS * math.sqrt(self._covariance[14, 14])
 
     def _squeezed(self) -> str:
-        """How frames contradict fx and fy, in one sentence, if they do."""
+        """Say in one sentence how frames contradict fx and fy; nothing if they do not."""
         squeeze, deviation = self._shown_squeeze
         if abs(squeeze) <= _SQUEEZED * math.hypot(deviation, self._aspect_ratio):
             return ""

@@ -43,7 +43,7 @@ def corner_of(camera: Camera) -> float:
 
 
 def centre_of(camera: Camera) -> Array:
-    """The principal point (2,), in delivered pixels."""
+    """Return the principal point (2,), in delivered pixels."""
     roi = camera.roi
     origin = (0.0, 0.0) if roi is None else (roi.x_offset, roi.y_offset)
     centre: Array = (camera.K[:2, 2] - origin) / camera.binning
@@ -52,7 +52,7 @@ def centre_of(camera: Camera) -> Array:
 
 @_remembered
 def off_centre(camera: Camera) -> bool:
-    """Whether the principal point is where no lens has it, but a K of another image has.
+    """Return whether the principal point is where no lens has it, but a K of another image has.
 
     Lenses are decentred by some 5 % of the image; regions of interest have theirs anywhere.
     """

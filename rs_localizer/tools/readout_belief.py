@@ -214,7 +214,7 @@ class Evidence:
         )
 
     def _why_not(self) -> str:
-        """Reason against it, as it goes on from the value; or ''."""
+        """Return the reason against it, as it goes on from the value; or ''."""
         if self.processed:
             return f"; {self.processed}"
         if abs(self.readout_time) > _LONGEST * self.stamps.interval:

@@ -134,7 +134,7 @@ def uncovered(result: CameraCalibration) -> list[str]:
 
 
 def table(found: CameraCalibration, rate: float | None) -> Iterator[str]:
-    """Rows of what was found, its parts, and remarks; ``rate``: of the images, as it was given."""
+    """Yield rows of what was found; ``rate``: of the images, as it was given."""
     if found.processed:  # before figures that it makes worthless
         yield f"warning: {found.processed}"
     for name, text in (
@@ -183,7 +183,7 @@ def of_lens(found: CameraCalibration) -> Iterator[str]:
 
 
 def _straightness(found: CameraCalibration) -> str:
-    """What a lens without distortion means; '' for all others."""
+    """Say what a lens without distortion means; nothing of all others."""
     camera = found.fit.camera
     width, height = np.array(camera.size) - 1.0
     corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])

@@ -131,7 +131,7 @@ def lens_difference(camera: Camera, other: Camera) -> LensErrors:
 
 
 def _field(camera: Camera) -> tuple[Array, Array]:
-    """Rays (n,3) through the image, and how what an error may be taken for moves pixels (2 n, 4).
+    """Return rays (n,3) through the image, and moves (2 n,4) that an error may be taken for.
 
     The corners come first; two shifts, a scale and a squeeze are what an error of the lens may be
     taken for.
