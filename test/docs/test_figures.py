@@ -92,3 +92,18 @@ def section(anchor: str) -> str:
         if heading.replace(" ", "-") == anchor:
             return part
     raise AssertionError(anchor)
+
+
+def test_the_table_of_what_is_noticed_is_what_its_bench_printed():
+    printed = dict[str, list[tuple[str, str]]]()
+    for line in (RESULTS / "kinds.txt").read_text(encoding="utf-8").splitlines()[1:-1]:
+        if not line.startswith(" "):
+            name, line = re.split(r"  +", line, maxsplit=1)
+        found = re.match(r" *(\d+) .* (\d+)  +\S", line)
+        assert found, line
+        printed.setdefault(name, []).append((found[1], found[2]))
+    (table,) = [t for t in pages.all_tables("kind", "said") if t.page == "docs/limits.md"]
+    assert {row[0] for row in table.rows} == {kind for kind in printed if "right" not in kind}
+    for kind, published, beyond, _ in table.rows:
+        said = list(zip(published.split(", "), beyond.split(", "), strict=True))
+        assert said == printed[kind], kind
