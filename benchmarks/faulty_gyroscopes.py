@@ -133,10 +133,10 @@ def table(faults: Sequence[str], recordings: int, seed: int) -> Table:
     row: list[str] = []
     for one in alone.values():
         row += [
-            f"{np.nanmedian(one.orientation):.3f} deg, {np.nanmedian(one.rate):.1f} deg/s",
+            f"{np.nanmedian(one.orientation):.3f}, {np.nanmedian(one.rate):.1f}",
             f"{100.0 * np.nanmean(one.inside):.0f}",
         ]
-    rows.append(["camera alone", *row, "", ""])
+    rows.append(["alone (deg, deg/s)", *row, "", ""])
     for fault in faults:
         row, used, said = [], [], ""
         for name, scene in SCENES.items():
