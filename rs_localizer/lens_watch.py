@@ -67,7 +67,7 @@ class LensWatch:
         self.fault = (
             f"residuals vary smoothly over the image ({off:.2g} px rms), more than the deviations "
             f"of calibration and map allow ({allowed:.2g} px): is the image of another mode or "
-            "resolution, rectified or stabilised, or of another camera, or is the map off? "
+            "resolution, rectified or stabilized, or of another camera, or is the map off? "
             "Calibrate in the mode that is used, or set map_deviation"
             if off > allowed
             else ""

@@ -40,7 +40,7 @@ def test_a_calibration_is_held_to_what_it_promises():
     """Of an ordinary one 0.2 px are no wonder, of a good one they are, and both are named."""
     fault = watched(3.5, WELL).fault
     assert "px rms), more than the deviations of calibration and map allow (0." in fault
-    assert all(word in fault for word in ("another mode", "rectified", "stabilised"))
+    assert all(word in fault for word in ("another mode", "rectified", "stabilized"))
     assert watched(3.5, CalibrationErrors()).fault == ""
 
 

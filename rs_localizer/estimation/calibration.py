@@ -2,13 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Effect of errors of calibration and map, the same in all frames, on a pose.
 
-Centre, focal lengths and distortion of an ordinary calibration have errors; so has a map that is
-bent, or whatever else a smooth error was fitted for; and landmarks that were found together are off
-together, as the map may tell (:class:`ErrorModes`). No tracker averages them away: they join what
-is published of a frame, and not what goes on to the next. To first order a calibration that moves
-the pixels by ``b`` moves motion and smooth error by ``-H^-1 A^T b``, with the derivatives ``A`` of
-the pixels by both and the information ``H = A^T A + noise^2 P`` of points and prior; and a smooth
-error of ``f`` deviations moves them by ``-noise^2 H^-1 f``.
+Principal point, focal lengths and distortion of an ordinary calibration have errors. A bent map
+has some too, or whatever else a smooth error was fitted for. Landmarks that were found together
+have common errors, which the map may state (:class:`ErrorModes`). No tracker averages these errors
+away: they are added to the published estimate of a frame, and not to what the next frame is given.
+
+``A`` are the derivatives of the pixels by motion and smooth error, and ``H = A^T A + noise^2 P`` is
+the information of points and prior. To first order a calibration that moves the pixels by ``b``
+moves motion and smooth error by ``-H^-1 A^T b``. A smooth error of ``f`` deviations moves them by
+``-noise^2 H^-1 f``.
 """
 
 from __future__ import annotations
@@ -64,7 +66,7 @@ class ErrorModes:
         self._modes = np.concatenate([modes, np.zeros((1, *modes.shape[1:]), modes.dtype)])
 
     def at(self, points: Array) -> Array:
-        """Modes (m,3,k) of points (m,3), zeros for those that are no landmarks."""
+        """Return modes (m,3,k) of points (m,3); zeros for points that are no landmarks."""
         # Along any direction, the same landmark is as near or nearer.
         along = points @ _ASKEW
         first = np.searchsorted(self._along, along - _SAME)
@@ -98,7 +100,7 @@ def calibration_effect(
     observed: Observed, posterior: Posterior, terms: PriorTerms, deviation: CalibrationErrors,
     tracked: bool, of_map: ErrorModes | None = None,
 ) -> CalibrationEffect:  # fmt: skip
-    """The effect on the motion of a frame.
+    """Return the effect of errors of calibration and map on the motion of a frame.
 
     Args:
         terms: what is known of the motion but for poses of other frames, which are off by as much.
@@ -148,7 +150,7 @@ def promised(posterior: Posterior) -> float:
 
 
 def widened(effect: CalibrationEffect, posterior: Posterior) -> CalibrationEffect:
-    """The effect of a calibration and a map whose errors are larger than they are declared.
+    """Return the effect of a calibration and a map whose errors exceed the declared ones.
 
     To a factor of e their size is not known (:mod:`.smooth_error`). What lies beyond is an error
     of the deviations, all of them alike (Birge's ratio): residuals do not tell which.
@@ -161,7 +163,7 @@ def widened(effect: CalibrationEffect, posterior: Posterior) -> CalibrationEffec
 def _lines(
     data: Array2, tau: Array1, state: Array1, shake: Array2, chosen: BoolArray1
 ) -> tuple[Array, Array, Array]:
-    """Derivatives (m,2,18) of the chosen points by the motion, rays (m,2), and row times (m,)."""
+    """Return derivatives (m,2,18) of chosen points by the motion, rays (m,2), row times (m,)."""
     lines = linearized(data, len(tau), state, shake_at(tau, shake))
     return lines.by_motion[chosen], lines.image[chosen], tau[chosen]
 
@@ -171,7 +173,7 @@ def _effect(
     by_motion: Array3, smooth: Array3, columns: Array3, state: Array1, terms: PriorTerms,
     parts: Array1, turn_known: bool, variance: float, inflation: float, tracked: bool,
 ) -> CalibrationEffect:  # fmt: skip
-    """How errors move motion and smooth error.
+    """Return how errors move motion and smooth error.
 
     Args:
         by_motion, smooth, columns: derivatives (n,2,18), (n,2,q) by the motion and the smooth
@@ -222,7 +224,7 @@ def _effect(
 
 
 def _columns(camera: Camera, towards: Array, deviation: CalibrationErrors) -> Array:
-    """Shifts (n,2,5) in px of rays or bearings by a standard deviation of each error."""
+    """Return shifts (n,2,5) px of rays or bearings by a standard deviation of each error."""
     corner = corner_of(camera)
     corner_pixels = corner * camera.focal_length / camera.binning[0]
     columns = np.zeros((len(towards), 2, _ERRORS))

@@ -1,19 +1,21 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The motion over the last frames: one trajectory, whose accelerations tell how large they are.
+"""The motion over the last frames: one trajectory, whose accelerations' deviations are learnt.
 
-Frames are samples of a trajectory of which accelerations fade while new ones come
-(:mod:`rs_localizer.estimation.motion_model`); what a frame's points say of its motion beside what
-was known before is a Gaussian ``exp(-d' L d / 2 + g' d)`` of the step ``d`` from its estimate. A
-filter runs forward through the window, a smoother back (Rauch et al., "Maximum likelihood
-estimates of linear dynamic systems", 1965). With the prediction's covariance ``P`` and the smoothed
-step ``x`` from it, of covariance ``V``, the score of the variance of one axis' accelerations, of
-which the transition adds ``Q`` to ``P``, is
+Frames are samples of a trajectory whose accelerations fade while new ones come
+(:mod:`rs_localizer.estimation.motion_model`). A frame's points, beside what was known before, give
+a Gaussian ``exp(-d' L d / 2 + g' d)`` of the step ``d`` from the frame's estimate. A filter runs
+forward through the window, and a smoother back (Rauch et al., "Maximum likelihood estimates of
+linear dynamic systems", 1965).
 
-    e' Q e - tr(Q M),      e = P^-1 x,      M = cov(e) = P^-1 - P^-1 V P^-1,
+``P`` is the covariance of the prediction, to which the transition adds ``Q`` for the accelerations
+of one axis. ``x`` is the smoothed step from the prediction, and ``V`` its covariance. The score of
+the variance of these accelerations is
 
-and a variance ``r`` times as large makes it ``(r - 1) tr(Q M Q M)`` in the mean: so the scales of
-a tripod, of a hand and of a car are found within a few frames, from below and from above.
+    e' Q e - tr(Q M),      e = P^-1 x,      M = cov(e) = P^-1 - P^-1 V P^-1.
+
+A variance ``r`` times as large makes it ``(r - 1) tr(Q M Q M)`` in the mean. So the scales of a
+tripod, of a hand and of a car are found within a few frames, from below and from above.
 """
 
 from __future__ import annotations
@@ -108,7 +110,7 @@ class MotionWindow:
     def begin(
         cls, start: Gaussian, acceleration: Acceleration, readout_share: float = 0.0
     ) -> MotionWindow:
-        """From a motion of which no other frame tells."""
+        """Begin with a motion of which no other frame tells."""
         configured = np.repeat([acceleration.angular, acceleration.linear], (3, 1)).astype(float)
         return cls(start, configured, configured.copy(), readout_share=readout_share)
 
@@ -138,7 +140,7 @@ class MotionWindow:
         return len(self.samples) + 1
 
     def before(self, frames: int) -> Gaussian:
-        """The motion so many frames before the last one, as all frames tell."""
+        """Return the motion so many frames before the last one, given all frames."""
         if self.solved is None:
             return self.start
         row = len(self.samples) - 1 - frames
@@ -150,11 +152,11 @@ class MotionWindow:
         )  # fmt: skip
 
     def after(self, time_ns: int) -> Gaussian:
-        """The motion at a time after the last frame."""
+        """Return the motion at a time after the last frame."""
         return _moved(self.newest, time_ns, self.deviations, self.readout_share)
 
     def at(self, time_ns: int) -> Gaussian | None:
-        """The motion at a time, as all frames tell; None before the first of them."""
+        """Return the motion at a time, given all frames; None before the first of them."""
         if time_ns < self.start.time_ns:
             return None
         if time_ns >= self.newest.time_ns:
@@ -172,7 +174,7 @@ class MotionWindow:
         return replace(self, samples=samples, solved=solved).before(len(self.samples) - row)
 
     def joined(self, sample: MotionSample) -> MotionWindow:
-        """With one more frame, and with what it tells of the accelerations."""
+        """Return the window with one more frame, and with learnt accelerations."""
         start, samples = self.start, (*self.samples, sample)
         if len(samples) >= LENGTH:
             assert self.solved is not None
@@ -187,7 +189,7 @@ class MotionWindow:
         return replace(self, start=start, samples=samples, deviations=deviations, solved=solved)
 
     def _learnt(self, deviations: Array, scores: Array) -> Array:
-        """Deviations (4,) that the scores (4,3) would rather have."""
+        """Return the deviations (4,) that the scores (4,3) prefer."""
         squared, expected, information = scores.T
         ratio = 1.0 + (squared - expected) / (information + _DOUBT)
         changed = deviations * np.sqrt(np.clip(ratio, _LEAST_CHANGE, _MOST_CHANGE))
@@ -263,7 +265,7 @@ def _predicted(
 
 @kernel
 def _noise(seconds: float, deviations: Array) -> Array:
-    """Covariance (18,18) that new accelerations add."""
+    """Return the covariance (18,18) that new accelerations add."""
     unit = singer(abs(seconds))
     noise = np.zeros((PARAMETERS, PARAMETERS))
     for i in range(3):
@@ -279,7 +281,7 @@ def _back(
     state: Array1, covariance: Array2, predicted: Array1, prediction: Array2, known: Array2,
     transport: Array2, smoothed: Array1, smoothed_covariance: Array2,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """A filtered motion with what the next sample's smoothed one tells of it.
+    """Smooth a filtered motion with the next sample's smoothed one.
 
     ``known``: (18,18) inverse of the prediction's covariance.
     """
@@ -349,7 +351,7 @@ def _solve(
 
 @entry
 def _told_by_points(covariance: Array2, known: Array2) -> Array:
-    """Information (18,18) of a posterior's covariance beside that which was known before.
+    """Return the information (18,18) of a posterior beyond its prior.
 
     By the eigenvalues of what was known, in units of the posterior: none of them exceeds 1.
     """
@@ -381,7 +383,7 @@ def _state(motion: Motion, units: Array) -> Array:
 
 
 def gaussian_of(estimate: Estimate, time_ns: int) -> Gaussian:
-    """Motion by one frame without its shaking, and without a gyroscope's turn."""
+    """Return the motion of one frame without vibration and without a gyroscope's rotation."""
     motion, covariance, _, _ = unshaken(estimate)
     if estimate.turn is not None:
         mean, spread = mean_turn(estimate.turn)
@@ -392,7 +394,7 @@ def gaussian_of(estimate: Estimate, time_ns: int) -> Gaussian:
 
 
 def motion_of(gaussian: Gaussian, span: float) -> tuple[Motion, Array]:
-    """The motion and its covariance (18,18), per readout of ``span`` s."""
+    """Return the motion and its covariance (18,18), per readout of ``span`` s."""
     units = 1.0 / _per_second(span)
     state = gaussian.state.copy()
     state[12:] *= units[6:]
@@ -441,7 +443,7 @@ def sample_of(estimate: Estimate, time_ns: int, known: PriorTerms, shared: Array
 
 
 def estimate_at(estimate: Estimate, gaussian: Gaussian) -> Estimate:
-    """A frame's estimate with what a window knows of its motion; residuals are as they were.
+    """Return a frame's estimate with the window's motion; residuals stay as they were.
 
     What shakes beside the motion goes along as far as the frame's covariance ties it to it.
     """
@@ -467,7 +469,7 @@ def estimate_at(estimate: Estimate, gaussian: Gaussian) -> Estimate:
 
 
 def predicted_estimate(nearest: Estimate, gaussian: Gaussian, swing: Array) -> Estimate:
-    """The motion between frames or after them, beside the points of the nearest frame.
+    """Return the motion between or after frames, with the points of the nearest frame.
 
     Args:
         swing: (18,18) covariance of the shaking about that motion, per readout.
@@ -483,7 +485,7 @@ def predicted_estimate(nearest: Estimate, gaussian: Gaussian, swing: Array) -> E
 
 
 def errors_ahead(window: MotionWindow, found: Estimate, swing: Array) -> Array:
-    """Squared errors (4,) over those claimed of the motion that a window predicts for an image.
+    """Return squared errors (4,), over the claimed ones, of the motion predicted for an image.
 
     Of turn, place, angular and linear velocity; 1 is as claimed, NaN without a covariance.
 

@@ -37,7 +37,7 @@ _CERTAIN = 0.95
 def sample_estimate(
     observed: Observed, state: Array, samples: int, threshold: float, fewest: int
 ) -> Estimate | Failure:
-    """The estimate of a minimal sample's model as it is, without a covariance.
+    """Return the estimate of a minimal sample's model as it is, without a covariance.
 
     Args:
         state: (24,) of the model.
@@ -73,7 +73,7 @@ def estimate_of(
     observed: Observed, posterior: Posterior, samples: int, effect: CalibrationEffect,
     predicted: bool,
 ) -> Estimate:  # fmt: skip
-    """The estimate of an accepted posterior, in the map frame and for all given points.
+    """Return the estimate of an accepted posterior, in the map frame, for all given points.
 
     Args:
         samples: minimal samples drawn.
@@ -120,7 +120,7 @@ def estimate_of(
 
 
 def _knows_velocities(posterior: Posterior) -> bool:
-    """Whether the points tell the velocities, or certainly rest.
+    """Return whether the points determine the velocities, or certainly rest.
 
     What they do not tell is a mean about zero, of rest and of all typical speeds: its deviation is
     that of the speeds that are left out of the mean.

@@ -207,7 +207,7 @@ class Evidence:
         if self.jitter > _BESIDE:
             why.append(f"exposures are {1e3 * self.jitter:.1f} ms rms off their stamps")
         return (
-            f"{' and '.join(why)}: is image stabilisation on, or was the video processed? Record "
+            f"{' and '.join(why)}: is image stabilization on, or was the video processed? Record "
             "with the camera's own time stamps, without losing images or re-encoding the video"
             if why
             else ""

@@ -92,17 +92,17 @@ def test_irregular_stamps_are_noticed_and_do_little_harm():
 
 
 def test_a_picture_that_is_turned_after_the_fact_makes_parts_disagree():
-    """Stabilisation: a part of the motion is taken out of the images, more or less of it."""
+    """Stabilization: a part of the motion is taken out of the images, more or less of it."""
     images = list(recording(0.02, seconds=1.0)) + [
         replace(image, stamp_ns=image.stamp_ns + 10**10)
         for image in recording(0.008, seconds=1.0, seed=22)
     ]
     found = calibrate(CAMERA, images)
     assert found.stabilised
-    assert "stabilisation" in verdict.refusal(found)
+    assert "stabilization" in verdict.refusal(found)
     first, *_ = verdict.table(found, None)  # before figures that look like findings
     assert first.startswith("warning: parts of the recording disagree (")
-    assert "is image stabilisation on" in first
+    assert "is image stabilization on" in first
     assert not any("times less likely" in remark for remark in verdict.remarks(found))
 
 
