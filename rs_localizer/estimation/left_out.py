@@ -109,7 +109,7 @@ class _Known(NamedTuple):
 def left_out(
     search: MotionSearch, observed: Observed, posterior: Posterior, threshold: float, known: bool
 ) -> LeftOut:
-    """Judgement of the points that a motion leaves out: what speaks against it.
+    """Judge the points that a motion leaves out: what contradicts the motion.
 
     Args:
         posterior: of an accepted motion.
@@ -164,7 +164,7 @@ def left_out(
 
 
 def _is_off_centre(observed: Observed) -> bool:
-    """Whether K's principal point alone speaks for another image."""
+    """Return whether K's principal point alone points to another image."""
     return off_centre(observed.sighted.exposure.cameras[0])
 
 
@@ -192,7 +192,7 @@ def _cameras_apart(observed: Observed, inliers: BoolArray, second: _Group, thres
 
 
 def _rough(observed: Observed, posterior: Posterior) -> str:
-    """Sentence on noise for which the gate was widened."""
+    """Describe the noise for which the gate was widened."""
     depth = observed.observations.median_depth(posterior.state, posterior.inliers)
     deviation = posterior.noise * depth / observed.assumed.focal_length
     return (
@@ -202,7 +202,7 @@ def _rough(observed: Observed, posterior: Posterior) -> str:
 
 
 def _odds(size: int, other: int, faster: float) -> float:
-    """Odds that a group of points is the world's and another one a body's, not the other way round.
+    """Return the odds that a group of points is the world's and the other one a body's.
 
     Of a body points are with an unknown chance below one half; the world has the motion that is
     expected of the camera, by squared velocities that differ by ``faster``.
@@ -215,7 +215,7 @@ def _odds(size: int, other: int, faster: float) -> float:
 def _own_motion(
     search: MotionSearch, observed: Observed, rest: BoolArray, threshold: float
 ) -> _Group | None:
-    """The motion that more of the points left out have than chance makes, or None."""
+    """Return the motion that more left-out points share than chance makes, or None."""
     own = search.among(observed, rest, _SAMPLE)
     if not own.found:
         return None
@@ -231,7 +231,7 @@ def _own_motion(
 
 
 def _area(observed: Observed) -> float:
-    """Pixels of the smallest image."""
+    """Return the pixels of the smallest image."""
     return float(min(math.prod(camera.size) for camera in observed.sighted.exposure.cameras))
 
 
@@ -239,7 +239,7 @@ def _of_another_lens(
     search: MotionSearch, observed: Observed, posterior: Posterior, second: _Group | None,
     threshold: float,
 ) -> Failure | None:  # fmt: skip
-    """Failure of a frame that another camera matrix explains better than two motions do."""
+    """Return the failure of a frame that another matrix explains better than two motions."""
     lens = _another_lens(search, observed, threshold)
     if lens is None:
         return None
@@ -267,9 +267,7 @@ def _of_another_lens(
 
 
 def _evidence(groups: tuple[_Group, ...], parameters: int, count: int, area: float) -> float:
-    """Logarithm of the evidence of groups of points, the others of so many being anywhere in an
-    image; by Schwarz's criterion.
-    """
+    """Return the log evidence of groups of points, the others anywhere in an image (Schwarz)."""
     inside = sum(int(np.count_nonzero(group.chosen)) for group in groups)
     freedom = max(2 * inside - parameters, 1)
     variance = max(
@@ -281,7 +279,7 @@ def _evidence(groups: tuple[_Group, ...], parameters: int, count: int, area: flo
 
 
 def _another_lens(search: MotionSearch, observed: Observed, threshold: float) -> _Lens | None:
-    """The motion of most points before a camera with another focal length and principal point."""
+    """Return the motion of most points with another focal length and principal point."""
     area, count = _area(observed), observed.observations.count
     kinds = (False, True) if _is_off_centre(observed) else (False,)
     found = [_lens_of(search, observed, threshold, of_size) for of_size in kinds]
@@ -295,8 +293,10 @@ def _another_lens(search: MotionSearch, observed: Observed, threshold: float) ->
 def _lens_of(
     search: MotionSearch, observed: Observed, threshold: float, of_size: bool
 ) -> _Lens | None:
-    """The same, of any image, or of one of another size whose K this is: then the principal point
-    goes with the focal length, and both show before a wall, where neither does alone.
+    """Return the motion of most points with another matrix: of any image, or of a resized one.
+
+    ``of_size``: K is of an image of another size. The principal point then moves with the focal
+    length, and both show before a wall, where neither does alone.
     """
     focal, last = observed.assumed.focal_length, WIDEST_GATE * threshold
     camera, most = observed.sighted.exposure.cameras[0], _SAMPLE + _LENS
@@ -336,8 +336,10 @@ def _lens_of(
 
 
 def _through(observed: Observed, lens: Array) -> Observed:
-    """The frame as a camera with another matrix saw it: its focal length in parts of K's, and how
-    far its principal point is from K's, in focal lengths (3,).
+    """Return the frame as a camera with another matrix saw it.
+
+    ``lens`` (3,) is its focal length over K's, and the offset of its principal point from K's, in
+    focal lengths.
     """
     seen, usable = observed.observations, observed.sighted.usable
     by_ray = lens[0] * usable.by_ray[usable.indices]
@@ -348,7 +350,7 @@ def _through(observed: Observed, lens: Array) -> Observed:
 
 
 def _step(observed: Observed, state: Array, lens: Array, known: _Known, gate: float) -> Array:
-    """Gauss and Newton's step (21,) of a motion and a lens, by the points within a gate."""
+    """Return Gauss and Newton's step (21,) of motion and lens, by the points within a gate."""
     seen, usable = observed.observations, observed.sighted.usable
     lines = linearized(seen.packed, seen.count, state, np.zeros((seen.count, 6)))
     near = np.square(lines.errors).sum(axis=1) < gate**2  # NaN is not
@@ -371,7 +373,7 @@ def _step(observed: Observed, state: Array, lens: Array, known: _Known, gate: fl
 
 
 def _moved_alike(observed: Observed, posterior: Posterior, rest: BoolArray) -> float:
-    """Part of the points that are left out that is off as its nearest neighbours are.
+    """Return the share of left-out points whose errors resemble those of their neighbours.
 
     It costs a tenth of a search, and mismatches seldom are.
     """
@@ -388,7 +390,7 @@ def _moved_alike(observed: Observed, posterior: Posterior, rest: BoolArray) -> f
 
 @entry
 def as_nearest(places: Array2, errors: Array2, rough: float) -> int:
-    """How many of the errors (n,2) of places (n,2) are those of the nearest one, about."""
+    """Count errors (n,2) of places (n,2) that roughly equal the one of the nearest place."""
     count, alike = len(places), 0
     for i in range(count):
         nearest, apart = 0, np.inf
@@ -403,8 +405,9 @@ def as_nearest(places: Array2, errors: Array2, rough: float) -> int:
 
 
 def _surprise(total: int, size: int, sample: int, chance: float) -> float:
-    """Negative logarithm of how many groups of a size, of which a sample has a motion whatever it
-    is, chance makes of so many mismatches.
+    """Return the negative log of the number of groups of ``size`` that chance makes of mismatches.
+
+    Any ``sample`` of points has a motion, so only points beyond it count.
     """
     if size <= sample:
         return 0.0
@@ -416,7 +419,7 @@ def _surprise(total: int, size: int, sample: int, chance: float) -> float:
 
 
 def _by_chance(observed: Observed, posterior: Posterior, wide: bool) -> Failure | None:
-    """Failure of a motion that fits no more points than chance makes fit, where all are near.
+    """Return the failure of a motion that fits no more near points than chance makes fit.
 
     Other mismatches lie anywhere; these may be a camera's that vibrates, or those of a rough map.
     """
@@ -438,7 +441,7 @@ def _by_chance(observed: Observed, posterior: Posterior, wide: bool) -> Failure 
 
 
 def _side(observed: Observed, inliers: BoolArray, group: BoolArray) -> str:
-    """On which side of the image a group of points lies, beside the inliers; empty: on none."""
+    """Name the side of the image on which a group of points lies; empty if on none."""
     if not observed.sighted.exposure.alone:
         return ""
     pixels = observed.sighted.pixels[observed.sighted.usable.indices]
