@@ -88,6 +88,9 @@ _NEWEST = 0.3
 _GIVEN_DELAY = 1e-4
 # Largest squared distance of a searched motion from the track: once in a million by chance.
 _MOST_INNOVATION = 62.0
+# Of the logarithm of the odds of a vibration, the part that the next frame has of it: sizes and
+# spectra last for ten frames.
+_REMEMBERED = 0.9
 # Covariance of a motion that is only a first guess.
 _UNKNOWN = np.diag(np.full(PARAMETERS, np.inf))
 # The least acceleration that a configuration may have, rad/s^2 and m/s^2.
@@ -115,6 +118,7 @@ class _Track:
     time_ns: int
     share: float  # of inliers among the points
     window: MotionWindow
+    vibrations: Array  # (s,f) logarithms of the odds of each vibration, by all frames
 
 
 @dataclass(slots=True)
@@ -601,6 +605,8 @@ class Tracker:
             rest = self.shutter.of_rest if turn is None else 0.0
             prior = replace(prior, covariance=_UNKNOWN, of_rest=rest)
         if turn is None:
+            if prior is not None and self._track is not None:
+                prior = replace(prior, of_vibration=self._track.vibrations)
             return prior
         from rs_localizer.inertial.gyro_prior import without_gyro
 
@@ -624,7 +630,12 @@ class Tracker:
         if track is not None and result.tracked:
             share = (1.0 - _NEWEST) * track.share + _NEWEST * share
         window = self._window(time_ns, prior, result, track, context)
-        self._track = _Track(result, time_ns, share, window)
+        vibrations = result.vibrations
+        if track is not None and track.vibrations.size:
+            # Beside a gyroscope they are of another kind: of what it leaves.
+            is_new = vibrations.size and result.turn is None
+            vibrations = track.vibrations + (vibrations if is_new else 0.0)
+        self._track = _Track(result, time_ns, share, window, _REMEMBERED * vibrations)
         self._errors.add(result, window, unshaken(result)[2])
 
     def _window(

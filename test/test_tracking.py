@@ -6,6 +6,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
+from benchmarks.frames.conditions import TRACKED, Condition, moving
+from benchmarks.frames.judged import judge
+from benchmarks.independent.scenes import Rich
 from rs_localizer import data
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import project_rolling
@@ -437,3 +440,14 @@ def test_residuals_are_those_of_the_published_motion():
         shown, _ = project_rolling(CAMERA, found.at_rows, points)
         errors = np.linalg.norm(shown - pixels, axis=1)
         np.testing.assert_allclose(found.residuals, errors, atol=1e-3)
+
+
+def test_a_track_learns_how_its_camera_vibrates(monkeypatch):
+    """One image hardly shows 0.03 deg at 200 Hz beside noise of 0.3 px; forty do."""
+    shaken = moving("vibration", degrees=0.03, hertz=200.0)
+    tracked = Condition("sine", "some", shaken, Rich(), 0.3, sequence=TRACKED)
+    learned = judge(tracked, 16, 1, {}).inside("twist")
+    assert len(learned) >= 30
+    monkeypatch.setattr("rs_localizer.tracking._REMEMBERED", 0.0)
+    assert np.mean(judge(tracked, 16, 1, {}).inside("twist")) < 0.5  # without memory
+    assert np.mean(learned) > 0.7

@@ -57,6 +57,8 @@ class Estimate(Motion):
     still_deviation: float = math.inf  # rad, orientation_deviation if the motion were known
     # (k,3) rad: what the camera turns beside the motion (rs_localizer.core.shake): vibration
     shake: Array = field(default_factory=np.zeros((0, 3)).copy)
+    # (s,f) logarithms of the evidence of each vibration by this frame, against none; empty: unknown
+    vibrations: Array = field(default_factory=np.zeros((0, 0)).copy)
     model_error: float = 0.0  # px, rms of what map, lens and motion leave beside the noise
     declared_error: float = 0.0  # px, what map and calibration are declared to leave of it
     tracked: bool = False  # found near a prior motion, without a search

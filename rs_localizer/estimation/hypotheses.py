@@ -29,10 +29,12 @@ from rs_localizer.estimation.leans import Frame, Mode, linear_at, mode_of, over_
 from rs_localizer.estimation.linear_fit import (
     MIDDLE,
     NO_TURN,
+    SPECTRA,
     TURNS,
     VIBRATION,
     Linear,
     Noise,
+    TurnPrior,
     fit,
     known_at,
     linear_of,
@@ -89,6 +91,8 @@ _HIDDEN_ODDS = math.log(10.0)
 # Logarithm of the evidence of an ordinary vibration against none from which it is fitted, and of
 # the ordinary spectrum, one of several, from which all are looked at.
 _ASKS, _MAY_SHAKE = -0.5, -1.8
+# One frame tells no more of a vibration than this logarithm of odds: none is as Gaussian as that.
+_MOST_TOLD = 5.0
 # The gate closes by this factor from step to step (graduated non-convexity).
 _CLOSING = 0.6
 # A last step this short, in squared standard deviations: the next one is its square.
@@ -286,9 +290,12 @@ def _of_outliers(given: _Given, inliers: BoolArray) -> float:
 def _with_turn(given: _Given, hypotheses: list[MotionHypothesis], steady: _Camera) -> list[_Camera]:
     """Return hypotheses without in-frame rotation, and with it if it is possible."""
     wide, vibrating = given.best.near_outliers > 0, None
-    gain, undetected = _hidden(given, steady.posterior)
+    prior, odds = _expected(given.assumed)
+    gain, undetected, vibrations = _hidden(given, steady.posterior, prior)
+    steady = steady._replace(posterior=steady.posterior._replace(vibrations=vibrations))
+    gain += odds
     if wide or gain > _ASKS:
-        vibrating = _vibrating(given, hypotheses, steady.posterior)
+        vibrating = _vibrating(given, hypotheses, steady.posterior, prior)
     if vibrating is None:
         weight = 1.0 / (1.0 + math.exp(min(_HIDDEN_ODDS - TEMPER * gain, 700.0)))
         return [steady._replace(posterior=steady.posterior._replace(
@@ -300,11 +307,21 @@ def _with_turn(given: _Given, hypotheses: list[MotionHypothesis], steady: _Camer
     return [steady, vibrating._replace(parts=vibrating.parts._replace(evidences=raised))]
 
 
-def _hidden(given: _Given, steady: Posterior) -> tuple[float, Array]:
+def _expected(assumed: Assumed) -> tuple[TurnPrior, float]:
+    """Return the prior of a vibration by the frames before, and the logarithm of its odds by them."""
+    if not assumed.of_vibration.size:
+        return VIBRATION, 0.0
+    odds = VIBRATION.odds + assumed.of_vibration
+    total = float(np.logaddexp.reduce(odds, axis=None))
+    return VIBRATION._replace(odds=odds - total), total
+
+
+def _hidden(given: _Given, steady: Posterior, prior: TurnPrior) -> tuple[float, Array, Array]:
     """Return evidence and effect of vibration at the best motion without it.
 
     Returns:
-        logarithm of its evidence, against none; (12,12) second moments of the motion by it.
+        logarithm of its evidence, against none; (12,12) second moments of the motion by it; (s,f)
+        logarithms of the evidence of each one.
     """
     best, shared = given.best, given.frame.shared.at(steady.shared)
     own = steady.shared**2 * shared.squares
@@ -313,17 +330,23 @@ def _hidden(given: _Given, steady: Posterior) -> tuple[float, Array]:
     noise = Noise(steady.noise, 1.0, decided)
     linear = linear_of(given.lines, best.inliers, True, shared.rows)
     known = known_at(given.terms, best.state)
-    found = fit(linear, shared, known, noise, VIBRATION.of_first(), True)
-    if found.gain > _MAY_SHAKE:
-        found = fit(linear, shared, known, noise, VIBRATION, True)
+    # A track learns of each spectrum.
+    looked = VIBRATION.of_first() if prior is VIBRATION else prior
+    found = fit(linear, shared, known, noise, looked, True)
+    if found.gain > _MAY_SHAKE and looked is not prior:
+        looked = prior
+        found = fit(linear, shared, known, noise, looked, True)
     none = np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS))
     if not found.evidence > -math.inf:
-        return -math.inf, none
+        return -math.inf, none, np.zeros((0, 0))
+    each = np.log(np.maximum(found.weights, TINY)) - looked.odds + found.gain
+    vibrations = np.tile(np.clip(each, -_MOST_TOLD, _MOST_TOLD), (len(SPECTRA) // len(each), 1))
     alone = fit(without(linear, "turn"), shared, known, noise, NO_TURN, True)
     place = slice(0, MOTION_PARAMETERS)
     move = _TURNED @ found.step - alone.step[place]
     beside = (found.noise / noise.deviation) ** 2 * alone.covariance[place, place]
-    return found.gain, _TURNED @ found.covariance @ _TURNED.T - beside + np.outer(move, move)
+    moments = _TURNED @ found.covariance @ _TURNED.T - beside + np.outer(move, move)
+    return found.gain, moments, vibrations
 
 
 def _with_middle(covariance: Array) -> Array:
@@ -356,7 +379,7 @@ def _at(given: _Given, state: Array, turn: Array, gate: float) -> _Turning:
 
 
 def _vibrating(
-    given: _Given, hypotheses: list[MotionHypothesis], steady: Posterior
+    given: _Given, hypotheses: list[MotionHypothesis], steady: Posterior, prior: TurnPrior
 ) -> _Camera | None:
     """Return hypotheses with in-frame rotation, if such a fit converges to as many points."""
     best, threshold, wide = given.best, given.threshold, given.best.near_outliers > 0
@@ -373,7 +396,7 @@ def _vibrating(
         beside = _beside_turn(given, now)
         known = known_at(given.terms, beside.state)
         found = fit(
-            beside.linear, beside.shared, known, Noise(noise, 1.0, decided), VIBRATION,
+            beside.linear, beside.shared, known, Noise(noise, 1.0, decided), prior,
             is_last or k == _STEPS - 1,
         )  # fmt: skip
         step = beside.step + found.step

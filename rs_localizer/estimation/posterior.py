@@ -73,6 +73,8 @@ class Posterior(NamedTuple):
     arched: Array | None = None
     # (12,12) of pose and velocities, beside the covariance: vibration that hides in the noise
     undetected: Array = np.zeros((12, 12))
+    # (s,f) logarithms of the evidence of each vibration, against none; empty: not looked at
+    vibrations: Array = np.zeros((0, 0))
     # (n,b): of what the smooth error is a combination (see frame_fit), which other frames share, so
     # that the covariance does not have it, either
     bend: Array = np.zeros((0, 0))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import NamedTuple
 
@@ -146,6 +146,8 @@ class Prior:
             times the readout time (rad per readout), and its standard deviation.
         of_rest: logarithm of the odds that the camera does not move within the image, beside
             those of any camera.
+        of_vibration: (s,f) logarithms of the odds of each vibration against none by other frames,
+            beside those of any camera (``Estimate.vibrations``); empty: there were none.
         gravity, gravity_deviation: a vector (3,) in camera axes at the middle row that points
             along ``gravity_in_map``, of any length, and the standard deviation of its direction
             in rad.
@@ -162,6 +164,7 @@ class Prior:
     gravity_deviation: float = math.nan
     gravity_in_map: ArrayLike = (0.0, 0.0, -1.0)
     of_rest: float = 0.0
+    of_vibration: Array = field(default_factory=np.zeros((0, 0)).copy)
 
     def __post_init__(self) -> None:
         if (self.motion is None) != (self.covariance is None):
@@ -571,6 +574,7 @@ class Assumed:
     may_rest: bool  # nothing speaks for a motion but the points
     rolling: bool  # velocities are estimated
     of_rest: float = 0.0  # logarithm of the odds for rest, beside those of any camera
+    of_vibration: Array = field(default_factory=np.zeros((0, 0)).copy)  # see Prior
     turn: TurnSeen | None = None  # by a gyroscope
 
 
@@ -604,12 +608,12 @@ def assumptions(
 def of_frame(
     terms: PriorTerms, assumed: Assumed, prior: Prior | None, turn: GyroRotation | None
 ) -> tuple[PriorTerms, Assumed]:
-    """Add knowledge of this frame, by a gyroscope or of rest, to terms and assumptions."""
+    """Add knowledge of this frame, by a gyroscope, of rest or of vibration, to terms and assumptions."""
     if turn is not None:
         assumed = replace(assumed, turn=turn_seen(terms, turn))
         terms = terms._replace(informations=_with_turn(terms.informations, turn.error))
     if prior is not None:
-        assumed = replace(assumed, of_rest=prior.of_rest)
+        assumed = replace(assumed, of_rest=prior.of_rest, of_vibration=prior.of_vibration)
         terms = with_measurements(terms, prior)
     return terms, assumed
 

@@ -108,6 +108,7 @@ def estimate_of(
         joint_covariance=covariance,
         undetected_covariance=posterior.undetected + beside[:MOTION_PARAMETERS, :MOTION_PARAMETERS],
         shake=posterior.shake,
+        vibrations=posterior.vibrations,
         model_error=posterior.model_error,
         declared_error=promised(posterior),
         iterations=samples,
