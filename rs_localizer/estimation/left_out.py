@@ -169,7 +169,7 @@ def _is_off_centre(observed: Observed) -> bool:
 
 
 def _cameras_apart(observed: Observed, inliers: BoolArray, second: _Group, threshold: float) -> str:
-    """Sentence on a camera of a rig that has a motion of its own; empty: that is not so.
+    """Name the camera of a rig that has a motion of its own; '' if none has.
 
     A body before it moves otherwise than most of its points. Where all of them do, no image tells
     which camera is where it is said to be, and no frame before this one does.
