@@ -306,16 +306,16 @@ class GyroscopeTrack:
         agrees = bool(far <= 1.0)
         self._contradictions.append(not agrees)
         self._age += 1
-        self._unused = None
+        often = sum(self._contradictions) >= _CONTRADICTIONS
         if not agrees:
             self.forget_motion()
-            often = sum(self._contradictions) >= _CONTRADICTIONS
-            reason = ImuReason.DISAGREES if often else ImuReason.DOUBTED
-            self._unused = Unused(reason, self._oddity())
             if often and self._age >= _WATCHED:
                 self._former = self.errors
                 self._begin()
-        return agrees
+        # What was contradicted often agrees by chance where the camera hardly turns.
+        reason = ImuReason.DISAGREES if often else ImuReason.DOUBTED
+        self._unused = None if agrees and not often else Unused(reason, self._oddity())
+        return self._unused is None
 
     def _learn(self, foreseen: _Foreseen, information: Array, pull: Array) -> None:
         spread, tied = foreseen.covariance, foreseen.tied
