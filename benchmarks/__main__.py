@@ -59,6 +59,7 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   real                             videos of real cameras; real gyro FOLDER: your own recording
   gross                            grossly wrong lenses and maps: what is published
   faulty_gyroscopes                gyroscopes that are wrong, beside the camera alone
+  kinds                            faults that no frame's model has: what is noticed
   mapping                          refined maps and surveyed markers
   fuzzing                          wrong input for everything that reads
   load                             live nodes under load

@@ -66,8 +66,11 @@ _LIKE_MOTION, _ALIKE = 0.002, math.exp(-1.0 / 30.0)
 # one. A camera that vibrates between its frames moves otherwise within them, or shows a readout
 # that is longer than the interval: 0.1 deg at 11 to 47 Hz make 2 to 600 times, or 60 ms; hands 1.3.
 _LEARNING, _MOST_UNLIKELY, _SHAKEN = 0.1, 4.0, 1.5
-# Deviation of fy over fx, before anything is known; letterboxes squeeze by a quarter.
-_ANY_SQUEEZE = 0.05
+# A gyroscope's rates vibrate if this share of the angular velocity is no parabola of the rows.
+_ROUGH = 0.1
+# Deviation of fy over fx, before anything is known. Letterboxes squeeze by a quarter, which frames
+# show nevertheless; with 0.05 some small planes that lean otherwise look squeezed by a tenth.
+_ANY_SQUEEZE = 0.02
 # What accelerations and the lean of a plane make of it lasts, too: before a right board it was off
 # by six of its deviations in 4 frames, before two walls and a phone's room by two at most.
 _LEANS = 2.5
@@ -197,7 +200,7 @@ class ShutterWatch:
         points, pixels = map(np.ascontiguousarray, (points[some], pixels[some]))
         self._looks.append(self._look(time_ns, found, points, pixels))
         # One that vibrates within its images goes elsewhere there than between them.
-        if len(self._looks) == 3 and not len(self._looks[1].found.shake):
+        if len(self._looks) == 3 and not _vibrates(self._looks[1].found):
             before, now, after = self._looks
             first, second = (now.time_ns - before.time_ns) * 1e-9, (time_ns - now.time_ns) * 1e-9
             alike = 1.0 / _MOST_UNLIKE < first / second < _MOST_UNLIKE
@@ -268,10 +271,7 @@ class ShutterWatch:
             step = covariance @ (weighed @ expected)
             variance = float(weights @ (expected - design @ step) ** 2 / np.sum(weights))
         self._mean, self._covariance = (prior + step)[6:], covariance[6:, 6:]
-        # A squeeze that is known does not change, and moves points as a turn does that is as large.
-        expected_change = np.full(14, wanders[0, 0])
-        expected_change[12:] += np.diag(known)[14:]
-        changed = float(np.mean(step[8:] ** 2 / expected_change))
+        changed = float(np.mean(step[8:20] ** 2 / wanders.diagonal()))
         changed = min(changed, _MOST_UNLIKELY * self._unlike)
         self._unlike = max(self._unlike + _LEARNING * (changed - self._unlike), 1.0)
         if self._unlike < _SHAKEN and np.all(np.abs(self._mean[:2]) < 0.55 * seconds):
@@ -372,3 +372,10 @@ class ShutterWatch:
         self.fault = f"estimated readout time {measured}{named} differs from readout_time = "
         self.fault += f"{1e3 * usual:g} ms"
         return kind
+
+
+def _vibrates(found: Estimate) -> bool:
+    """Return whether points, or a gyroscope, show a vibration within an image."""
+    turn = found.turn
+    rough = turn is not None and turn.roughness > _ROUGH * np.linalg.norm(found.angular_velocity)
+    return bool(rough or len(found.shake))

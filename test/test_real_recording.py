@@ -168,7 +168,7 @@ def test_corners_lie_where_those_of_other_rows_say(recording):
         squared.append(squared_normalized(errors, spread + noise * np.eye(2)))
     squared = np.concatenate(squared)
     assert np.mean(squared < chi2.ppf(0.95, 2)) > 0.93
-    assert 1.0 < np.mean(squared) < 2.4  # 2 are expected
+    assert 0.9 < np.mean(squared) < 2.4  # 2 are expected, and fx, fy may be off by 0.3 %
 
 
 def test_a_twist_that_is_a_mean_of_rest_and_motion_is_unknown(recording):
