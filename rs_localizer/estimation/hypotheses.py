@@ -308,7 +308,7 @@ def _with_turn(given: _Given, hypotheses: list[MotionHypothesis], steady: _Camer
 
 
 def _expected(assumed: Assumed) -> tuple[TurnPrior, float]:
-    """Return the prior of a vibration by the frames before, and the logarithm of its odds by them."""
+    """Return the prior of a vibration by the frames before, and the logarithm of its odds."""
     if not assumed.of_vibration.size:
         return VIBRATION, 0.0
     odds = VIBRATION.odds + assumed.of_vibration

@@ -608,7 +608,7 @@ def assumptions(
 def of_frame(
     terms: PriorTerms, assumed: Assumed, prior: Prior | None, turn: GyroRotation | None
 ) -> tuple[PriorTerms, Assumed]:
-    """Add knowledge of this frame, by a gyroscope, of rest or of vibration, to terms and assumptions."""
+    """Add what is known of this frame by a gyroscope, of rest or of vibration."""
     if turn is not None:
         assumed = replace(assumed, turn=turn_seen(terms, turn))
         terms = terms._replace(informations=_with_turn(terms.informations, turn.error))
