@@ -7,13 +7,11 @@ while rows, or columns, are read. Let the rows take the time ``T_r``, negative i
 the direction that is set. Let the columns take ``T_c``: drivers that rotate images turn the scan
 sideways. The points of a frame are then off by
 
-    e = J d + (tau_r T_r + tau_c T_c) J v + J (tau_r m_r + tau_c m_c) + s q + noise
+    e = J d + (tau_r T_r + tau_c T_c) J v + J (tau_r m_r + tau_c m_c) + noise
 
 ``J`` is the derivative by the pose, ``d`` the error of the pose, and ``m`` the effect of errors of
-map and lens, which is alike in neighbouring frames. An image that is squeezed beside its K, by
-``s``, moves its points by ``s q``: to first order a turn across the rows, but the same one in all
-frames. A Kalman filter estimates ``T_r, T_c``, whose evidence fades, both ``m``, which wander, and
-``s``, which stays. The right shutter is ``(T, 0)``, a global one ``(0,
+map and lens, which is alike in neighbouring frames. A Kalman filter estimates ``T_r, T_c``, whose
+evidence fades, and both ``m``, which wander. The right shutter is ``(T, 0)``, a global one ``(0,
 0)``, a reversed one ``(-T, 0)``; off the first axis the shutter runs along the other one.
 """
 
@@ -68,14 +66,6 @@ _LIKE_MOTION, _ALIKE = 0.002, math.exp(-1.0 / 30.0)
 _LEARNING, _MOST_UNLIKELY, _SHAKEN = 0.1, 4.0, 1.5
 # A gyroscope's rates vibrate if this share of the angular velocity is no parabola of the rows.
 _ROUGH = 0.1
-# Deviation of fy over fx, before anything is known. Letterboxes squeeze by a quarter, which frames
-# show nevertheless; with 0.05 some small planes that lean otherwise look squeezed by a tenth.
-_ANY_SQUEEZE = 0.02
-# What accelerations and the lean of a plane make of it lasts, too: before a right board it was off
-# by six of its deviations in 4 frames, before two walls and a phone's room by two at most.
-_LEANS = 2.5
-_SQUEEZED = 3.0  # deviations, from which fx and fy are contradicted
-_SQUEEZE = np.array([[-0.5, 1.0], [0.5, 1.0]])  # of u and v, by fy over fx, and by both
 # A shutter is contradicted beyond this many deviations, if it is also off by more than this share.
 _SURELY, _LEAST_DIFFERENCE = 4.0, 0.06
 # If the setting is known to this share, this many of this many frames are enough.
@@ -116,7 +106,6 @@ class _Look(NamedTuple):
     units: Array  # (6,) rad and m, of a velocity
     rows: Array  # (2 n,18) px, derivatives by pose, and by the way over the rows, and over columns
     off: Array  # (2 n,) px, of the points if the camera did not move
-    squeeze: Array  # (2 n,2) px, by which points move if fy over fx, or both, are twice as large
 
     def over_columns(self) -> Array:
         """Return the pose's step and velocity (12,) that fit the points if rows are columns."""
@@ -131,17 +120,15 @@ class ShutterWatch:
     Args:
         camera: as it is set; None: there is nothing to compare.
         threshold: px, of inliers.
-        aspect_ratio: deviation of its fy over fx, a share.
     """
 
-    def __init__(self, camera: Camera | None, threshold: float, aspect_ratio: float = 0.0) -> None:
-        self._gate, self._aspect_ratio = _GATE * threshold, aspect_ratio
-        self._camera = camera
+    def __init__(self, camera: Camera | None, threshold: float) -> None:
+        self._gate, self._camera = _GATE * threshold, camera
         if camera is not None:
             self._exposure = Rig.of(camera).exposure().ahead()
             self._direction, self._centre = ScanDirection(camera.scan_direction), centre_of(camera)
             self._sideways = replace(camera, scan_direction=ACROSS[self._direction])
-            spread = np.repeat([_ANY * camera.readout_time, _LIKE_MOTION, _ANY_SQUEEZE], [2, 12, 2])
+            spread = np.repeat([_ANY * camera.readout_time, _LIKE_MOTION], [2, 12])
             self._any = np.diag(spread**2)
         self.reset()
 
@@ -165,7 +152,7 @@ class ShutterWatch:
         self._looks: deque[_Look] = deque(maxlen=3)
         self._frames = 0
         if self._camera is not None:
-            self._mean, self._covariance = np.zeros(16), self._any
+            self._mean, self._covariance = np.zeros(14), self._any
             self._unlike = 1.0  # by how much the square of what wanders is more than usual
 
     @property
@@ -229,9 +216,7 @@ class ShutterWatch:
         rows = np.concatenate([by_pose, over_rows, over_columns], axis=2).reshape(-1, 18)
         speed = np.r_[found.angular_velocity, found.linear_velocity] / units
         off = rows[:, 6:12] @ speed - lines.errors[near].ravel()
-        places = (pixels[own][near] - self._centre)[:, :, None]
-        squeeze = (places * _SQUEEZE).reshape(-1, 2)
-        return _Look(time_ns, found, units, rows, off, squeeze)
+        return _Look(time_ns, found, units, rows, off)
 
     def _measure(self, before: _Look, now: _Look, after: _Look, seconds: float) -> None:
         """Add the evidence of a frame whose neighbours are this many s apart."""
@@ -248,20 +233,18 @@ class ShutterWatch:
         if not moves or len(now.off) < 2 * now.rows.shape[1]:
             return
         speed, rows = way / (seconds * now.units), now.rows
-        design = np.c_[
-            rows[:, :6], rows[:, 6:12] @ speed, rows[:, 12:] @ speed, rows[:, 6:], now.squeeze
-        ]
+        design = np.c_[rows[:, :6], rows[:, 6:12] @ speed, rows[:, 12:] @ speed, rows[:, 6:]]
         spread, most = self._covariance[:2, :2].diagonal().max(), self._any[0, 0]
         memory = math.sqrt(min(1.0 / _MEMORY, most / spread))
-        lasting = np.repeat([memory, _ALIKE, 1.0], [2, 12, 2])
+        lasting = np.repeat([memory, _ALIKE], [2, 12])
         known = self._covariance * np.outer(lasting, lasting)
-        wanders = (1.0 - _ALIKE**2) * self._any[2:14, 2:14]
-        known[2:14, 2:14] += self._unlike * wanders
+        wanders = (1.0 - _ALIKE**2) * self._any[2:, 2:]
+        known[2:, 2:] += self._unlike * wanders
         prior = np.r_[np.zeros(6), self._mean]
-        prior[8:20] *= _ALIKE
-        information = np.zeros((22, 22))
+        prior[8:] *= _ALIKE
+        information = np.zeros((20, 20))
         information[6:, 6:] = np.linalg.inv(known)
-        expected, step = now.off - design @ prior, np.zeros(22)
+        expected, step = now.off - design @ prior, np.zeros(20)
         variance = float(np.median(expected**2)) / 0.455  # of a normal distribution
         for _ in range(_ROUNDS):
             left, variance = expected - design @ step, max(variance, _LEAST_NOISE**2)
@@ -271,7 +254,7 @@ class ShutterWatch:
             step = covariance @ (weighed @ expected)
             variance = float(weights @ (expected - design @ step) ** 2 / np.sum(weights))
         self._mean, self._covariance = (prior + step)[6:], covariance[6:, 6:]
-        changed = float(np.mean(step[8:20] ** 2 / wanders.diagonal()))
+        changed = float(np.mean(step[8:] ** 2 / wanders.diagonal()))
         changed = min(changed, _MOST_UNLIKELY * self._unlike)
         self._unlike = max(self._unlike + _LEARNING * (changed - self._unlike), 1.0)
         if self._unlike < _SHAKEN and np.all(np.abs(self._mean[:2]) < 0.55 * seconds):
@@ -325,35 +308,6 @@ class ShutterWatch:
             self.trusted = False
         elif doubt < _SHOWN:
             self.trusted = True
-        if squeezed := self._squeezed():
-            # What turns it takes for is in every image, and in no way from one to the next.
-            self.fault = "; ".join(filter(None, (self.fault, squeezed)))
-            self.kind, self.trusted = self.kind or "aspect", False
-
-    @property
-    def squeeze(self) -> float:
-        """By how much fy over fx is surely off, a share: rows of all frames are so by as much."""
-        if self._camera is None:
-            return 0.0
-        squeeze, deviation = self._shown_squeeze
-        return math.sqrt(max(squeeze**2 - 4.0 * deviation**2, 0.0))
-
-    @property
-    def _shown_squeeze(self) -> tuple[float, float]:
-        """How much larger fy over fx is than K's, and the deviation of that."""
-        return float(self._mean[14]), _LEANS * math.sqrt(self._covariance[14, 14])
-
-    def _squeezed(self) -> str:
-        """Say in one sentence how frames contradict fx and fy; nothing if they do not."""
-        squeeze, deviation = self._shown_squeeze
-        if abs(squeeze) <= _SQUEEZED * math.hypot(deviation, self._aspect_ratio):
-            return ""
-        return (
-            f"fx and fy are not those of the image: fy over fx is {1.0 + squeeze:.3f} +- "
-            f"{deviation:.3f} times K's, where calibration.aspect_ratio allows "
-            f"{self._aspect_ratio:g}: is the image squeezed (letterbox, anamorphic, 1088 rows as "
-            "1080)? It looks like a turn across the rows, so twists are widened"
-        )
 
     def _name(self, measured: MeasuredReadout, usual: float) -> str:
         """Describe the fault of the set readout time and return its kind, if it has one."""

@@ -31,7 +31,6 @@ from rs_localizer.core.arrays import Array, BoolArray, instance
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import ByCamera, Rig, RigEstimate
-from rs_localizer.core.scanning import ROW_BY_ROW
 from rs_localizer.core.state import (
     ANGULAR,
     PARAMETERS,
@@ -188,7 +187,6 @@ class Tracker:
             from rs_localizer.inertial.gyro_prior import GyroscopeTrack
 
             self._aid = GyroscopeTrack(inertial, localizer.camera.readout_time)
-        self._like_squeeze = _like_squeeze(localizer)
 
     def reset(self) -> None:
         """Forget all frames so far."""
@@ -207,8 +205,7 @@ class Tracker:
         config, cameras = self.localizer.config, list(self.localizer.rig.cameras.values())
         timed = len(cameras) == 1 and cameras[0].readout_time > 0.0
         watched = timed and find_solver(config.solver).rolling_shutter
-        aspect_ratio = config.calibration.aspect_ratio
-        return ShutterWatch(cameras[0] if watched else None, config.inlier_threshold, aspect_ratio)
+        return ShutterWatch(cameras[0] if watched else None, config.inlier_threshold)
 
     @property
     def inertial(self) -> InertialStatus | None:
@@ -644,10 +641,9 @@ class Tracker:
     ) -> MotionWindow:  # fmt: skip
         """Return a window of the last frames and this one; if it denies them, of this one alone."""
         share = self.readout_time_deviation(context) / result.span
-        start, shared = gaussian_of(result, time_ns), self.shutter.squeeze * self._like_squeeze
-        rate = shared / result.span
-        start = start._replace(covariance=start.covariance + np.outer(rate, rate))
-        alone = MotionWindow.begin(start, self.localizer.config.acceleration, share)
+        alone = MotionWindow.begin(
+            gaussian_of(result, time_ns), self.localizer.config.acceleration, share
+        )
         if track is None:
             return alone
         window = track.window
@@ -657,7 +653,7 @@ class Tracker:
         near = prior if result.tracked else None
         try:
             known = self.localizer.known_of(near, result.span, result.turn)
-            sample = sample_of(result, time_ns, known, shared)
+            sample = sample_of(result, time_ns, known)
             window = replace(window, readout_share=share).joined(sample)
         except np.linalg.LinAlgError:  # rounding errors are all that is left of a covariance
             return alone
@@ -693,16 +689,3 @@ def _check_motion(localizer: Localizer) -> None:
         raise ValueError(
             f"tracking needs velocities, which solver {localizer.config.solver} does not find"
         )
-
-
-def _like_squeeze(localizer: Localizer) -> Array:
-    """Step (18,), rad per readout, that an image looks like whose rows are twice as far apart.
-
-    Cameras of a rig that look elsewhere tell it from a turn: of several it is zero.
-    """
-    turn, cameras = np.zeros(PARAMETERS), list(localizer.rig.cameras.values())
-    if len(cameras) == 1:
-        along = int(cameras[0].scan_direction in ROW_BY_ROW)
-        extent = cameras[0].size[along] / cameras[0].focal_length
-        turn[ANGULAR.start + 1 - along] = extent
-    return turn

@@ -418,12 +418,11 @@ def told_of(estimate: Estimate, known: PriorTerms) -> MotionSample:
     return MotionSample(estimate.time_ns, state, _told_by_points(covariance, information), slope)
 
 
-def sample_of(estimate: Estimate, time_ns: int, known: PriorTerms, shared: Array) -> MotionSample:
+def sample_of(estimate: Estimate, time_ns: int, known: PriorTerms) -> MotionSample:
     """Sample by the points of an estimate, beside what was known of its motion before.
 
     Args:
         known: that, in the map's frame; of an estimate with a gyroscope beside the known turn.
-        shared: (18,) step by which the motion of every frame may be off alike.
     """
     told = told_of(estimate, known)
     state, information, slope = told.state.copy(), told.information, told.gradient
@@ -434,9 +433,6 @@ def sample_of(estimate: Estimate, time_ns: int, known: PriorTerms, shared: Array
         left = np.linalg.inv(np.eye(PARAMETERS) + information @ spread)
         information, slope = left @ information, left @ slope
         information = 0.5 * (information + information.T)
-    seen = information @ shared
-    share = seen / (1.0 + shared @ seen)
-    information, slope = information - np.outer(seen, share), slope - share * (shared @ slope)
     units = _per_second(estimate.span)
     state[12:] *= units[6:]
     return MotionSample(time_ns, state, information / np.outer(units, units), slope / units)

@@ -195,8 +195,7 @@ class CameraFrames(FrameLocalizer):
         shutter = self._tracker.shutter
         if shutter.fault and shutter.kind not in self._faults:
             self._faults.add(shutter.kind)
-            notice = Notice.LENS if shutter.kind == "aspect" else Notice.READOUT_TIME
-            self._notice(notice, shutter.fault)
+            self._notice(Notice.READOUT_TIME, shutter.fault)
 
     def _published(self, cloud: Correspondences, result: Estimate | Failure) -> Localized | Refusal:
         """Return a result of the body at the published moment."""

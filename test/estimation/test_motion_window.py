@@ -8,7 +8,7 @@ from scipy.linalg import expm
 
 import rs_localizer as rsl
 from rs_localizer.config import Acceleration
-from rs_localizer.core.state import PARAMETERS, step_between
+from rs_localizer.core.state import step_between
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.motion_window import (
     LENGTH,
@@ -217,7 +217,7 @@ def test_points_tell_what_the_posterior_knows_beside_its_prior():
     before = np.linalg.inv(spread)
     before[6:12, 6:12] += np.eye(6)  # the velocities of the settings
     posterior = np.linalg.inv(information + before)
-    sample = sample_of(estimate(posterior @ gradient, posterior), 7, known, np.zeros(PARAMETERS))
+    sample = sample_of(estimate(posterior @ gradient, posterior), 7, known)
     scale = np.sqrt(np.diag(information + before))
     np.testing.assert_allclose(
         sample.information / np.outer(UNITS * scale, UNITS * scale),

@@ -247,23 +247,6 @@ def test_who_calls_the_library_learns_within_fifteen_frames(direction, start):
         assert watch.measured.odds(READOUT, 0.0) > 4.0
 
 
-@pytest.mark.parametrize("squeeze", [0.97, 1.05])
-def test_a_squeezed_image_is_told_from_a_turn_and_from_a_readout_time(squeeze):
-    """Rows that are nearer together than K says look like a turn, but the same in all frames."""
-    tracker = Tracker(Localizer(CAMERA))
-    for message, _ in frames_with_truth(count=40):
-        cloud = read_correspondences(message)
-        pixels = (cloud.pixels - [319.5, 239.5]) * [1.0, squeeze] + [319.5, 239.5]
-        tracker.localize(cloud.stamp_ns, cloud.points, pixels)
-    watch = tracker.shutter
-    found = re.match(r"fx and fy are not .*: fy over fx is (\S+) \+- (\S+) times K's", watch.fault)
-    assert found, watch.fault
-    assert abs(float(found[1]) - squeeze) < 3.0 * float(found[2]) < 0.02
-    assert not watch.trusted  # what rows show of a turn is not the camera's
-    assert watch.measured is not None
-    assert not watch.measured.contradicts(READOUT)
-
-
 @dataclass(frozen=True)
 class Shaken:
     """A car that turns slowly, and whose camera shakes about three axes."""
