@@ -124,7 +124,7 @@ def test_what_a_lens_is_off_by_stays_with_it(flight, tmp_path):
         {name: value for name, value in load_params_file(file).items() if "calibration." in name}
         for file in (lens, both)
     ]
-    assert len(off[0]) == 3
+    assert len(off[0]) == 4
     assert off[0] == off[1]
 
 
