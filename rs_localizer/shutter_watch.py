@@ -135,13 +135,13 @@ class ShutterWatch:
     def reset(self) -> None:
         """Forget all frames."""
         self.measured: MeasuredReadout | None = None
-        """What the last seconds of motion showed along the axis that is set; None: nothing yet."""
+        """Readout time that the last seconds of motion show along the set axis; None: none yet."""
         self.fault = self.kind = ""
         """How that contradicts the setting, in one sentence, and in one word."""
         self.refusal = ""
         """Why no pose can be told: the shutter moves along the other axis."""
         self.error = 0.0
-        """How far (s) the setting is off, where it is contradicted."""
+        """Error (s) of the set readout time, if the motion contradicts it; else 0."""
         self.trusted = True
         """Whether the way from frame to frame tells that within them: not in doubt, nor after one
         before frames show it. To and fro between both, poses jump."""

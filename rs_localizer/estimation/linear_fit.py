@@ -122,9 +122,9 @@ def _vibration() -> TurnPrior:
 
 
 VIBRATION = _vibration()
-"""Of a camera that nothing but its images measures."""
+"""Prior of the in-frame turn of a camera without a gyroscope."""
 NO_TURN = TurnPrior(np.zeros((0, TURNS, TURNS)), np.zeros(0), FACTORS, np.zeros((0, len(FACTORS))))
-"""Of products without this block."""
+"""Prior for products that have no columns of an in-frame turn."""
 
 
 class Linear(NamedTuple):

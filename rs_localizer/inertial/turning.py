@@ -34,10 +34,10 @@ from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.native import entry
 
 PARAMETERS = 10
-"""Of what a gyroscope is off by, in this order."""
+"""Number of a gyroscope's errors; their places are BIAS, DELAY, SCALE and MOUNT."""
 BIAS, DELAY, SCALE, MOUNT = slice(0, 3), slice(3, 4), slice(4, 7), slice(7, 10)
 BETWEEN, RATE, CHANGE = slice(0, 3), slice(3, 6), slice(6, 9)
-"""Of what it says: the turn since the last frame, the rate within this one, and its change."""
+"""Places of the turn since the last frame, the rate in this frame, and its change."""
 
 # Deviation (s) of stamps of single frames and samples beside a constant delay, at best.
 _JITTER = 4e-5
