@@ -3,8 +3,7 @@
 """``python -m benchmarks.real FOLDER``: real videos of boards, together; each in OUT/real.csv.
 
 ``python -m benchmarks real gyro FOLDER``: turn rates before a gyroscope, of your own recording.
-``python -m benchmarks real tum-rs FOLDER``, ``mocap BAG``: poses and velocities before motion
-capture.
+``python -m benchmarks real aria FOLDER``: a head's real motion before its room's points.
 
 FOLDER holds videos and ``index.csv``, a line for each: file, inner corners, side of a square (m),
 as ``walk.mp4,8x6,0.025``. Settings of the method as everywhere: ``-p map_deviation:=0.0005``.
@@ -21,16 +20,14 @@ from pathlib import Path
 from statistics import median
 
 from benchmarks.experiments.results import Table, rounded
-from benchmarks.real import gyro, motion, tum_rs
+from benchmarks.real import gyro, motion
 from benchmarks.real.clips import clips_of, opencv_lens, shutter_of
 from benchmarks.real.judging import METHODS, judged
 from benchmarks.real.peers import PEERS
 from benchmarks.real.recordings import add_settings
 from rs_localizer.cli.settings_args import given_settings
 
-JUDGES = {
-    "gyro": gyro.main, "aria": motion.main, "tum-rs": tum_rs.main, "mocap": tum_rs.mocap,
-}  # fmt: skip
+JUDGES = {"gyro": gyro.main, "aria": motion.main}
 """Beside the boards, by the first argument."""
 
 
