@@ -56,7 +56,7 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   frames                           regions, errors and times of frames; two versions compared
   integrity                        the chance of a wrong pose or map: reliability, ROC
   rigs                             several cameras, against their bounds
-  real                             videos of real cameras; real gyro FOLDER: your own recording
+  real                             videos of real cameras; real gyro BAG: before a gyroscope
   gross                            grossly wrong lenses and maps: what is published
   faulty_gyroscopes                gyroscopes that are wrong, beside the camera alone
   kinds                            faults that no frame's model has: what is noticed

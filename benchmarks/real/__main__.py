@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``python -m benchmarks.real FOLDER``: real videos of boards, together; each in OUT/real.csv.
 
-``python -m benchmarks real gyro FOLDER``: turn rates before a gyroscope, of your own recording.
+``python -m benchmarks real gyro BAG``: turn rates before a gyroscope, of your own recording.
 ``python -m benchmarks real aria FOLDER``: a head's real motion before its room's points.
 
 FOLDER holds videos and ``index.csv``, a line for each: file, inner corners, side of a square (m),

@@ -1,17 +1,13 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m benchmarks real gyro FOLDER``: turn rates before a real gyroscope, and a picture.
+"""``python -m benchmarks real gyro BAG``: turn rates before a real gyroscope, and a picture.
 
-FOLDER is what people record at home (:mod:`benchmarks.real.footage`): a folder of Stray Scanner,
-one of images with ``frames.csv`` and ``imu.csv``, or a video with a gyroscope inside. Points are
-those of a printed board (``--board 9x6``), of the phone's depths, or of COLMAP. Or it is a bag
-with ``camera_info`` and correspondences, and ``--gyroscope FILE`` a text of lines ``t wx wy wz`` (s
-by the clock of the stamps, rad/s in the camera's optical axes; with ``--align`` by another clock
-and in other axes). No estimator sees the gyroscope. Beside twists there are the turns from pose to
-pose, of which estimators without a shutter have some, too:
+BAG has ``camera_info`` and correspondences, as ``detect`` writes them of a video of a board, and
+``--gyroscope FILE`` is a text of lines ``t wx wy wz`` (s by the clock of the stamps, rad/s in the
+camera's optical axes; with ``--align`` by another clock and in other axes). No estimator sees the
+gyroscope. Beside twists there are the turns from pose to pose, of which estimators without a
+shutter have some, too:
 
-    python -m benchmarks real gyro 71de12f9 -p readout_time:=0.015
-    python -m benchmarks real gyro GX010042.MP4 --board 9x6 --square 0.025
     python -m benchmarks real gyro rec --gyroscope gyroscope.txt -p readout_time:=0.0318 \\
         -p stamp_offset:=-0.0028
 """
@@ -28,21 +24,17 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.experiments.results import Table
-from benchmarks.real.footage import read_footage
 from benchmarks.real.gyroscopes import Gyroscope, aligned, best_offset, in_images
 from benchmarks.real.motion import AHEAD
 from benchmarks.real.peers import PEERS, GlobalPose, solve_pnp_ransac
 from benchmarks.real.recordings import Recording, add_settings, read_bag
-from benchmarks.real.tracks import record, record_board
 from rs_localizer.cli.settings_args import given_settings
-from rs_localizer.config import LocalizerConfig, NodeConfig
+from rs_localizer.config import LocalizerConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.state import ANGULAR
 from rs_localizer.core.types import Estimate
-from rs_localizer.io.camera_files import read_calibration
 from rs_localizer.localizer import Localizer
-from rs_localizer.markers.prints import Chessboard
 from rs_localizer.tools.errors import BLUE, ORANGE
 from rs_localizer.tracking import Tracker
 
@@ -286,20 +278,16 @@ def main(argv: Sequence[str]) -> None:
         prog="python -m benchmarks.real gyro", description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
-    parser.add_argument("recording", type=Path, help="a folder, a video, or a bag")
-    parser.add_argument("--gyroscope", type=Path, help="t wx wy wz, held back (bags need it)")
+    parser.add_argument("recording", type=Path, help="a bag")
+    parser.add_argument("--gyroscope", type=Path, required=True, help="t wx wy wz, held back")
     parser.add_argument("--align", action="store_true", help="find its clock, axes and bias")
-    parser.add_argument("--board", help="inner corners of a printed board, as 9x6")
-    parser.add_argument("--square", type=float, default=0.025, help="m, its side")
-    parser.add_argument("--camera", type=Path, help="file of the lens, where it is known")
-    parser.add_argument("--images", type=int, default=300, help="most, the first ones")
     parser.add_argument("--out", type=Path, default=Path("real"), help="picture")
     add_settings(parser)
     args = parser.parse_args(argv)
     config = given_settings(args)
     args.out.mkdir(parents=True, exist_ok=True)
-    recording, gyroscope = _read(args, config)
-    if args.align or args.gyroscope is None:
+    recording, gyroscope = read_bag(args.recording, config), Gyroscope.read(args.gyroscope)
+    if args.align:
         gyroscope, said = aligned(gyroscope, recording)
         print(said, file=sys.stderr)
     judged = judge(recording, gyroscope, config)
@@ -307,16 +295,3 @@ def main(argv: Sequence[str]) -> None:
     print(table(judged).text(), *predicted(recording, gyroscope, config), sep="\n")
     print(agreement(judged, gyroscope, readout_time))
     draw(judged, gyroscope, readout_time, args.out / "gyro.png")
-
-
-def _read(args: argparse.Namespace, config: NodeConfig) -> tuple[Recording, Gyroscope]:
-    if args.gyroscope is not None:
-        return read_bag(args.recording, config), Gyroscope.read(args.gyroscope)
-    footage = read_footage(args.recording)
-    camera = None if args.camera is None else read_calibration(args.camera)
-    if args.board is None:
-        return record(footage, camera, config, args.images, args.out), footage.gyroscope
-    columns, lines = (int(word) for word in args.board.split("x"))
-    board = Chessboard(columns, lines, args.square)
-    recording = record_board(footage, board, camera, config, args.images, args.out)
-    return recording, footage.gyroscope

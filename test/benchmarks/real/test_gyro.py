@@ -4,7 +4,6 @@
 
 import numpy as np
 import pytest
-from recorded import add_telemetry, write_mp4
 from scipy.spatial.transform import Rotation
 
 from benchmarks.independent import motions
@@ -12,17 +11,14 @@ from benchmarks.independent.cameras import Camera as TrueCamera
 from benchmarks.independent.frames import Frames, simulate
 from benchmarks.independent.scenes import Rich
 from benchmarks.real import __main__ as command
-from benchmarks.real.footage import read_footage
 from benchmarks.real.gyro import judge
 from benchmarks.real.gyroscopes import Gyroscope, aligned
 from benchmarks.real.peers import PEERS, solve_pnp
 from benchmarks.real.recordings import Frame, Recording, read_bag
-from benchmarks.real.tracks import record_board
 from rs_localizer.config import CalibrationErrors, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.recording import write_frame
-from rs_localizer.markers.prints import Chessboard
 
 TRUE = TrueCamera()
 LENGTH = 8
@@ -116,34 +112,6 @@ def test_clock_axes_and_bias_of_a_gyroscope_are_found():
     assert np.degrees(np.median(np.linalg.norm(found.rates - truth.rates, axis=1))) < 0.5
     with pytest.raises(ValueError, match="7 pairs of neighbours are localized, 20 are needed"):
         aligned(moved, Recording("short", camera, images[:8]))
-
-
-def test_a_video_brings_its_gyroscope_and_readout_time(tmp_path):
-    video, board = (
-        write_mp4(tmp_path / "walk.mp4", [np.zeros((48, 64), np.uint8)] * 3, 30.0),
-        (Chessboard(9, 6, 0.025)),
-    )
-    with pytest.raises(ValueError, match="has no gyroscope inside"):
-        read_footage(video)
-    seconds = np.arange(0.0, 2.0, 0.005)
-    add_telemetry(video, seconds, np.outer(np.sin(seconds), [0.5, 0.2, -0.4]), 0.016)
-    camera = Camera(640, 480, K=TRUE.matrix)
-    points = (board.points - board.points[0]) @ np.diag([1.0, -1.0, -1.0])
-    pixels = []
-    for turn in Rotation.random(40, rng=np.random.default_rng(0)).as_rotvec():
-        seen = Rotation.from_rotvec(0.2 * turn).apply(points - points.mean(axis=0)) + np.array(
-            [0, 0, 0.5]
-        )
-        pixels.append(camera.project(seen))
-    np.savez(tmp_path / "walk_corners.npz", times=np.arange(40) / 30.0, pixels=pixels,
-             size=(640, 480))  # fmt: skip
-    footage = read_footage(video)
-    recording = record_board(footage, board, None, NodeConfig(), 600, tmp_path)
-    assert len(recording.frames) == 40
-    assert recording.camera.readout_time == pytest.approx(0.016)
-    assert recording.frames[3].middle_ns == pytest.approx(1e8 + 8e6, abs=1e5)
-    assert recording.camera.focal_length == pytest.approx(camera.focal_length, rel=0.01)
-    assert len(footage.gyroscope.times) > 350
 
 
 @pytest.mark.parametrize("name", PEERS)
