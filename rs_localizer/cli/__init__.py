@@ -14,13 +14,7 @@ from typing import Any
 from tqdm import tqdm
 
 from rs_localizer.cli.options import UsageError
-from rs_localizer.io.atomic_files import (
-    atomic_files,
-    check_writable,
-    content,
-    resume,
-    resume_results,
-)
+from rs_localizer.io.atomic_files import atomic_files, check_writable, content
 
 # Bars are shown by one process. tqdm's own lock for several is a semaphore, of which Python 3.14
 # says that it leaked when a signal ends the command.
@@ -44,9 +38,6 @@ def earlier_result(
         ValueError: the directory must not be replaced, or is something else.
     """
     out: Path = place or args.out
-    resume_results([out])
-    if resume(out):
-        raise ValueError(f"another command is writing to {out}; wait until it ends")
     there = content(out)
     if not out.exists() or (out.is_dir() and not there):
         return ()

@@ -19,14 +19,13 @@ import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
 import rs_localizer
 from rs_localizer.cli.options import MORE, CommonOptions, Parser, UsageError, add_options, read
 from rs_localizer.config import meant
-from rs_localizer.io.atomic_files import remove_unfinished, resume_results
+from rs_localizer.io.atomic_files import remove_unfinished
 from rs_localizer.process.missing import explain
 from rs_localizer.process.stopping import INTERRUPTED, StopRequest
 
@@ -135,7 +134,6 @@ def main(
             module = importlib.import_module(COMMANDS[name].module)
         options, common = parse(name, module, words)
         StopRequest.clean_up.append(remove_unfinished)
-        resume_results(_paths(options))
         with _output(common) as kept:
             result = module.run(options)
         if common.json and kept is not None:
@@ -171,14 +169,6 @@ def parse(name: str, module: ModuleType, words: Sequence[str]) -> tuple[Any, Com
     add_options(parser, module.Options, CommonOptions)
     found = parser.parse_args(list(words))
     return read(module.Options, found), read(CommonOptions, found)
-
-
-def _paths(options: Any) -> list[Path]:
-    """Return all paths among the options of a command."""
-    values = itertools.chain.from_iterable(
-        value if isinstance(value, list) else [value] for value in vars(options).values()
-    )
-    return [value for value in values if isinstance(value, Path)]
 
 
 def _chosen(given: Sequence[str]) -> tuple[str, Sequence[str]]:

@@ -22,8 +22,7 @@ from rs_localizer.io.atomic_files import (
     atomic_directory,
     atomic_files,
     content,
-    resume,
-    resume_results,
+    remove_unfinished,
     write_errors,
 )
 from rs_localizer.process import ignore_working_folder
@@ -193,7 +192,6 @@ def perform_all(
         for task in again.values():
             future = client.submit(perform, task, pure=False)
             future.exception()
-            resume(task.folder.parent)  # what a worker that was killed has left
             yield task, _outcome(future)
 
 
@@ -205,7 +203,6 @@ def _outcome(future: Any) -> Outcome:
 
 def refuse_others(tasks: Sequence[Task]) -> None:
     """Raise ``ValueError`` for a folder that is there, and no result of its task."""
-    resume_results(task.folder for task in tasks)
     for task in tasks:
         if content(task.folder) and finished(task) is None:
             raise ValueError(
@@ -241,7 +238,7 @@ def do_all(
                     outcomes[task.folder] = outcome
                     heard(task, outcome)
         finally:
-            resume(out)
+            remove_unfinished(out)  # what workers that were killed have left
             for task in tasks:  # done before, or not heard of, as after Ctrl-C
                 outcomes.setdefault(task.folder, finished(task) or "not done")
             _summarize({task: outcomes[task.folder] for task in tasks}, out / SUMMARY)

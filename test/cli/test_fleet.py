@@ -20,7 +20,7 @@ import pytest
 
 from rs_localizer.cli.commands import main
 from rs_localizer.offline import fleet
-from rs_localizer.offline.fleet import Outcome, Task, perform, perform_all, tasks_of
+from rs_localizer.offline.fleet import Outcome, Task, do_all, perform, tasks_of
 
 SHUTTER = ["-p", "readout_time:=0.03"]
 
@@ -154,11 +154,12 @@ def test_a_recording_that_kills_its_process_does_not_stop_the_others(tmp_path, m
     out.mkdir()
     tasks = tasks_of([tmp_path / name for name in ("deadly", "good", "fine")], out, work.kill, "")
     tasks += tasks_of([tmp_path / "another"], out, work.leave, "")
-    outcomes = {task.recording.name: outcome for task, outcome in perform_all(tasks, None, 1)}
+    found = do_all(tasks, out, None, 1, lambda task, outcome: None)
+    outcomes = {task.recording.name: found[task.folder] for task in tasks}
     assert outcomes["good"] == outcomes["fine"] == {"frames": 1}
     assert outcomes["deadly"].startswith("lost: ")
     assert outcomes["another"].startswith("lost: ")
-    assert sorted(path.name for path in out.iterdir()) == ["fine", "good"]
+    assert sorted(path.name for path in out.iterdir() if path.is_dir()) == ["fine", "good"]
 
 
 def test_ctrl_c_leaves_whole_results_only_and_the_next_run_goes_on(

@@ -3,16 +3,10 @@
 """Results appear whole or not at all; a disk that takes no more is named."""
 
 import errno
-import functools
-import itertools
-import json
 import os
-import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -21,8 +15,7 @@ from rs_localizer.io.atomic_files import (
     atomic_directory,
     atomic_files,
     content,
-    resume,
-    resume_results,
+    remove_unfinished,
 )
 
 
@@ -100,19 +93,8 @@ def test_an_empty_directory_is_filled_and_an_earlier_result_replaced(tmp_path):
     assert (out / "lost+found").is_dir()
 
 
-# -- deaths -----------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def quick_disk(monkeypatch):
-    """Nobody waits for the disk: that matters where power fails, not where a process dies."""
-    monkeypatch.setattr(os, "fsync", lambda descriptor: None)
-
-
 OLD = {"same": "old", "gone": "old", "folder/same": "old", "folder/gone": "old"}
 NEW = {"same": "new", "more": "new", "folder/same": "new", "folder/more": "new"}
-# All that changes a name or waits for the disk.
-STEPS = ("mkdir", "rename", "replace", "unlink", "rmdir", "fsync")
 
 
 def make(folder: Path, files: dict[str, str]) -> None:
@@ -129,113 +111,8 @@ def tree(folder: Path) -> dict[str, str]:
 
 def write_directory(place: Path) -> None:
     out = place / "out"
-    resume_results([out])
     with atomic_directory(out, content(out)) as built:
         make(built, NEW)
-
-
-def write_files(place: Path) -> None:
-    make(place, {})
-    with atomic_files(*(place / "out" / name for name in ("same", "more"))) as parts:
-        for part in parts:
-            part.write_text("new")
-
-
-def dies(work: Callable[[], None], step: int) -> bool:
-    """Do it in a process that dies right after so many steps, as by kill -9; False: it did not."""
-    if (child := os.fork()) == 0:
-        left = itertools.count(step, -1)
-
-        def deadly(function: Callable[..., Any]) -> Callable[..., Any]:
-            def called(*given: Any, **named: Any) -> Any:
-                result = function(*given, **named)
-                if next(left) == 0:
-                    os._exit(9)
-                return result
-
-            return called
-
-        try:
-            for name in STEPS:
-                setattr(os, name, deadly(getattr(os, name)))
-            work()
-        except BaseException:
-            os._exit(1)
-        os._exit(0)
-    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    assert code in (0, 9)
-    return code == 9
-
-
-def deaths(tmp_path: Path, old: dict[str, str] | None, write: Callable[[Path], None]) -> Any:
-    """A place for each step of writing, at which death came right after it."""
-    for step in itertools.count():
-        place = tmp_path / str(step)
-        place.mkdir()
-        if old is not None:
-            (place / "out").mkdir()
-            make(place / "out", old)
-        died = dies(functools.partial(write, place), step)
-        yield place
-        if not died:
-            break
-    assert step > 10  # steps have been counted at all
-
-
-@pytest.mark.parametrize("old", [None, {}, OLD])
-@pytest.mark.usefixtures("quick_disk")
-def test_whenever_a_process_dies_the_next_finds_the_old_or_the_new_result(tmp_path, old):
-    found = []
-    for place in deaths(tmp_path, old, write_directory):
-        out = place / "out"
-        resume_results([out / "same"])  # a command that reads a file of it
-        there = {name: text for name, text in tree(out).items() if not name.startswith(".")}
-        assert there in (old or {}, NEW)
-        assert out.exists() or old is None
-        found.append(there == NEW)
-        write_directory(place)  # the next command
-        assert tree(place) == {f"out/{name}": text for name, text in NEW.items()}
-        assert os.listdir(place) == ["out"]
-        assert sorted(os.listdir(out)) == ["folder", "more", "same"]
-    assert found == sorted(found)  # it does not come back
-    assert not found[0]
-    assert found[-1]
-
-
-@pytest.mark.usefixtures("quick_disk")
-def test_whenever_a_process_dies_files_that_belong_together_change_together(tmp_path):
-    found = []
-    for place in deaths(tmp_path, {"same": "old", "other": "mine"}, write_files):
-        out = place / "out"
-        resume_results([out / "same"])
-        there = {name: text for name, text in tree(out).items() if not name.startswith(".")}
-        found.append(there == {"same": "new", "more": "new", "other": "mine"})
-        assert found[-1] or there == {"same": "old", "other": "mine"}
-        write_files(place)
-        assert tree(out) == {"same": "new", "more": "new", "other": "mine"}
-        assert sorted(os.listdir(out)) == ["more", "other", "same"]
-    assert found == sorted(found)
-    assert set(found) == {False, True}
-
-
-@pytest.mark.usefixtures("quick_disk")
-def test_whenever_one_dies_that_resumes_the_next_goes_on(tmp_path):
-    for place in deaths(tmp_path, OLD, write_directory):
-        # Every other one: they are many.
-        if int(place.name) % 2 or not list(place.glob("out/.unfinished-*/.journal")):
-            continue
-        saved = tmp_path / "saved"
-        shutil.copytree(place, saved)
-        for step in itertools.count():
-            died = dies(functools.partial(resume_results, [place / "out"]), step)
-            resume_results([place / "out"])
-            there = tree(place / "out")
-            assert {k: v for k, v in there.items() if not k.startswith(".")} in (OLD, NEW)
-            if not died:
-                break
-            shutil.rmtree(place)
-            shutil.copytree(saved, place)
-        shutil.rmtree(saved)
 
 
 def test_all_is_on_the_disk_before_what_was_goes(tmp_path, monkeypatch):
@@ -250,16 +127,16 @@ def test_all_is_on_the_disk_before_what_was_goes(tmp_path, monkeypatch):
     def move(source: Path, target: Path) -> None:
         if Path(source).parent == tmp_path / "out":
             gone.append(Path(source).name)
-            work = Path(target).parents[1]
-            made, journal = work / "out", work / ".journal"
-            needed = [*made.rglob("*"), made, journal, work, work.parent]
-            assert all(path.stat().st_ino in synced for path in needed)
+            made = [path for path in (Path(target).parents[1] / "out").rglob("*") if path.is_file()]
+            assert len(made) == len(NEW)
+            assert all(path.stat().st_ino in synced for path in made)
         rename(source, target)
 
     monkeypatch.setattr(os, "fsync", sync)
     monkeypatch.setattr(os, "rename", move)
     write_directory(tmp_path)
     assert sorted(gone) == ["folder", "gone", "same"]
+    assert tree(tmp_path / "out") == NEW
 
 
 def test_what_cannot_be_replaced_stays_and_does_not_block(tmp_path, monkeypatch):
@@ -281,36 +158,22 @@ def test_what_cannot_be_replaced_stays_and_does_not_block(tmp_path, monkeypatch)
     assert tree(tmp_path / "out") == NEW
 
 
-def test_who_works_is_not_disturbed(tmp_path):
-    """Each process has a workplace of its own, which is locked while it lives."""
-    (tmp_path / "out").mkdir()
-    with atomic_directory(tmp_path / "out") as built:
-        make(built, NEW)
-        assert resume(tmp_path / "out")
-        assert tree(built) == NEW
-        write_directory(tmp_path / "other")
-    assert tree(tmp_path / "out") == NEW
-    assert not resume(tmp_path / "out")
-
-
-def test_workplaces_of_earlier_versions_and_journals_of_strangers(tmp_path):
-    """The first have no lock; the second, as in an archive, reach no further than their folder."""
-    make(tmp_path, {"secret": "s", "out/.unfinished-0123456789abcdef/out/same": "new"})
-    for number, journal in enumerate(
-        (
-            {"folder": "", "names": ["../../secret"], "earlier": []},
-            {"folder": "../..", "names": ["secret"], "earlier": []},
-            {"folder": "away", "names": ["secret"], "earlier": []},
-            {"folder": "", "names": [], "earlier": ["../secret"]},
-            {"folder": "", "names": [".."], "earlier": []},
-            {"folder": "..", "names": [], "earlier": []},
-            {"folder": "", "names": [], "earlier": [""]},
-            ["no", "journal"],
-        )
-    ):
-        work = tmp_path / "out" / f".unfinished-{number}"
-        make(work, {".journal": json.dumps(journal), ".old/a": ""})
-        (work / "away").symlink_to(tmp_path)
-    assert not resume(tmp_path / "out")
-    assert tree(tmp_path) == {"secret": "s"}
-    assert content(tmp_path / "out") == os.listdir(tmp_path / "out") == []
+@pytest.mark.parametrize("old", [{}, OLD])
+def test_who_was_killed_blocks_nothing(tmp_path, old):
+    make(tmp_path / "out", old)
+    code = (
+        "import os; from pathlib import Path\n"
+        "from rs_localizer.io.atomic_files import atomic_directory, content\n"
+        "with atomic_directory(Path('out'), content(Path('out'))) as built:\n"
+        "    built.mkdir(); (built / 'same').write_text('half'); os._exit(9)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=False).returncode == 9
+    place = tmp_path / "out"
+    left = list(tmp_path.rglob(".unfinished-*"))
+    assert len(left) == 1
+    assert content(place) == sorted({name.split("/")[0] for name in old})
+    write_directory(tmp_path)
+    assert content(place) == ["folder", "more", "same"]
+    assert {name: (place / name).read_text() for name in NEW} == NEW
+    remove_unfinished(left[0].parent)
+    assert not list(tmp_path.rglob(".unfinished-*"))
