@@ -16,7 +16,7 @@ from rs_localizer.native import COMPILES
 PACKAGE = Path(__file__).parents[1] / "rs_localizer"
 
 # Code in LLVM's own terms, imported while kernels are compiled.
-TRACED = ("core/simd/tracing.py", "core/simd/vector_type.py")
+TRACED = ("core/simd/tracing.py",)
 # What each part may import besides itself; every part has a row.
 METHOD = {
     *("core", "config", "solvers", "estimation", "inertial", "integrity", "localizer"),

@@ -46,7 +46,7 @@ _BUDGETS = (
     Budget("r6p_vct_wt", 1, 0.45, 30.0),
     Budget("r6p_vc_wt", 1, 0.45, 27.0),
     Budget("r9p", 1, 0.60, 20.0),
-    Budget("r6p", 1, 14.0, 1700.0),
+    Budget("r6p", 1, 140.0, 1700.0),
 )
 
 

@@ -4,182 +4,190 @@
 
     lambda x = (I + r [w]x) (I + [v]x) X + C + r t
 
-The polynomial solver that the linear ones are measured against: the system of Albl, Kukelova,
-Pajdla, "R6P - Rolling shutter absolute camera pose", CVPR 2015, solved by a smaller elimination:
+The polynomial solver that the linear ones are measured against, in NumPy: the system of Albl,
+Kukelova, Pajdla, "R6P - Rolling shutter absolute camera pose", CVPR 2015, solved by a smaller
+elimination:
 
 1. The translations are linear; an orthogonal transformation of the twelve equations removes
    them. Six remain, bilinear in v and w: ``A(v) [w; 1] = 0``, A 6x4 with linear entries.
-2. A drops rank at up to 20 v, of which v_y are the eigenvalues of a 20x20 matrix
-   (:mod:`rs_localizer.solvers.rank_drop`); only the real ones in range are followed up.
-3. v follows from v_y, w from the null vector of A(v), and Newton steps on the six equations
-   polish both; then C and t.
+2. All fifteen 4x4 minors of A vanish at up to 20 v: quartics with 35 monomials. They express
+   those of degree four by the 20 others, and multiplication by v_y thereby becomes a 20x20 matrix
+   whose eigenvectors are these 20 monomials at the solutions (Cox, Little, O'Shea, "Using
+   Algebraic Geometry", 2005, sec. 2.4). Only real eigenvalues in range are followed up.
+3. v follows from the eigenvector, w from the null vector of A(v), and Newton steps on the six
+   equations polish both; then C and t.
 
 Six points in the frame of the initial rotation, any unit of length, |v| below a bound (|v| is the
-tangent of the angle to the initial rotation); up to 20 solutions. The hidden variable is v_y; v_x
-would do as well, while v_z, the turn about the optical axis, costs a digit of the eigenvalues.
+tangent of the angle to the initial rotation); up to 20 solutions. The multiplier is v_y; v_x would
+do as well, while v_z, the turn about the optical axis, costs a digit of the eigenvalues.
 """
 
 from __future__ import annotations
 
-import math
-from typing import Any
+import itertools
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, Array1, Array2, Array3, IntArray2, Out
-from rs_localizer.core.simd.algebra import cross, dot, least_squares, triangularize
-from rs_localizer.core.simd.eigenvalues import real_eigenvalues, reduce_to_hessenberg
-from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, select, traced
-from rs_localizer.core.simd.vectors import lane_array
-from rs_localizer.native import entry, inlined
-from rs_localizer.solvers import linear, rank_drop
-from rs_localizer.solvers.batch import MODEL_SIZE, Sample, gather, inputs, scatter
-from rs_localizer.solvers.rank_drop import RELATIONS, SOLUTIONS
+from rs_localizer.core.arrays import Array, IntArray
 
-SAMPLE_SIZE = 6
+SAMPLE_SIZE, SOLUTIONS = 6, 20
 # Largest |v|, 45 degrees from the initial rotation. Below it the solver finds everything that the
 # authors' code finds. Solutions beyond it were never within 5 degrees of the truth (none of 248
 # samples without other solutions, from initial rotations up to 25 degrees off, at up to 30 degrees
 # per readout and 1 px).
 BOUND = 1.0
 
-_INPUTS = inputs(SAMPLE_SIZE)
-_A = 6 * 4 * 4  # rows, columns (w and one constant), coefficients (constant and v)
-_CANDIDATE = RELATIONS + 2  # relations, an eigenvalue, the bound
-_SOLUTION = MODEL_SIZE + 3  # model, v
+_BLOCK = 256  # samples at a time: 10 MB
+_NEAR = 2.0  # the bound of what Newton's steps polish, over that of solutions
 _NEWTON_STEPS = 2
 _CONVERGED = 1e-7  # the longest last step; another one would be about its square
+_AXES = np.eye(3)
+
+# Exponents of v in the monomials, those up to each degree first: 1 x y z xx ...
+_MONOMIALS = sorted(
+    (m for m in itertools.product(range(5), repeat=3) if sum(m) <= 4),
+    key=lambda m: (sum(m), [-power for power in m]),
+)
+_COUNT = (1, 4, 10, 20, 35)  # monomials up to that degree
 
 
-def _begin(values: list[Lanes]) -> Vector:
-    """Return the rotated points and the coefficients of A(v)."""
-    sample = Sample(values, SAMPLE_SIZE)
-    points, rays, tau = sample.rotated_points(), sample.rays, sample.tau
-    turned = linear.rotation_columns(points, rays)
-    axes = ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
-    twice = [linear.rotation_columns([cross(e, x) for x in points], rays) for e in axes]
-    entries = []  # of A: column by column, the coefficients of 1 and v
-    for j in range(3):
-        by_v = [twice[i][j] for i in range(3)]
-        entries += [linear.times_row(column, tau) for column in (turned[j], *by_v)]
-    right = linear.right_hand_side(points, rays)
-    entries += [([-x for x in right[0]], [-y for y in right[1]]), *turned]
-    depth = linear.depth_column(rays)
-    columns = [depth, linear.times_row(depth, tau), *entries]
-    # C_x and t_x occur in the first kind of equations only, C_y and t_y in the second.
-    lateral = [linear.lateral_column(SAMPLE_SIZE), [-r for r in tau]]
-    firsts, seconds = [list(first) for first, _ in columns], [list(second) for _, second in columns]
-    triangularize([*lateral, *firsts, *seconds], 2)
-    reduced = [f[2:] + s[2:] for f, s in zip(firsts, seconds, strict=True)]
-    triangularize(reduced, 2)
-    a = [column[2 + row] for row in range(6) for column in reduced[2:]]
-    return sample.with_results(points, sample.rotation, a)
+def _place(*factors: tuple[int, ...]) -> int:
+    return _MONOMIALS.index(tuple(map(sum, zip(*factors, strict=True))))
 
 
-def _polish(a: list[list[Vector]], v: Vector) -> tuple[Vector, Vector, Any]:
-    """Return the newton steps on ``A(v) [w; 1] = 0``: v, w, and the square of the last step."""
+def _products(degree: int) -> Array:
+    """Return (4 m, k): what a product with a linear polynomial makes of one of that degree."""
+    factors = itertools.product(_MONOMIALS[:4], _MONOMIALS[: _COUNT[degree]])
+    return np.eye(_COUNT[degree + 1])[[_place(*pair) for pair in factors]]
 
-    def matrix(v: Vector) -> list[Vector]:
-        return [[entry[0] + dot(entry[1:], v) for entry in row] for row in a]
 
-    rows = matrix(v)
-    w = least_squares([[row[j] for row in rows] for j in range(3)], [-row[3] for row in rows])
-    step: Vector = []
+def _minors(size: int) -> tuple[IntArray, IntArray]:
+    """Return the rows (m, size) of all minors, and the places of the minors without each of them.
+
+    Minors are numbered by their rows, and expanded along their last column (Laplace).
+    """
+    smaller = list(itertools.combinations(range(6), size - 1))
+    rows = list(itertools.combinations(range(6), size))
+    others = [[smaller.index((*of[:i], *of[i + 1 :])) for i in range(size)] for of in rows]
+    return np.array(rows), np.array(others)
+
+
+_EXPANSIONS = [(*_minors(size), _products(size - 1)) for size in (2, 3, 4)]
+_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])[:, None]
+_TIMES_Y = np.array([_place(m, (0, 1, 0)) for m in _MONOMIALS[:SOLUTIONS]])
+
+
+class _Solutions(NamedTuple):
+    """Solutions of some samples, those of a sample in the order of their |v|."""
+
+    sample: IntArray  # (c,)
+    number: IntArray  # (c,) in the sample, from 0
+    v: Array  # (c,3)
+    w: Array  # (c,3)
+    c: Array  # (c,3)
+    t: Array  # (c,3)
+
+
+def find_solutions(points: Array, rays: Array, tau: Array, bound: float = BOUND) -> _Solutions:
+    """Return all solutions with |v| below ``bound``.
+
+    Args:
+        points: (h,6,3) in the frame of the initial rotation.
+        rays: (h,6,2)
+        tau: (h,6)
+    """
+    with np.errstate(all="ignore"):
+        a = _eliminated(points, rays, tau)
+        size = np.abs(a).max((1, 2, 3))
+        sample = np.flatnonzero(np.isfinite(size) & (size > 0.0))
+        points, rays, tau = points[sample], rays[sample], tau[sample]
+        a = a[sample] / size[sample, None, None, None]
+        found, v = _candidates(a, bound)
+        v, w, change = _polished(a[found], v)
+        length = np.linalg.norm(v, axis=1)
+        kept = (change < _CONVERGED) & (length < bound)
+        kept = np.flatnonzero(kept)[np.lexsort((length[kept], found[kept]))]
+        found, v, w = found[kept], v[kept], w[kept]
+        c, t = _translations(points[found], rays[found], tau[found], v, w)
+        number = np.arange(len(found)) - np.searchsorted(found, found)
+    return _Solutions(sample[found], number, v, w, c, t)
+
+
+def _seen(vectors: Array, rays: Array) -> Array:
+    """Return (...,12): the equations of vectors (...,6,3) that should lie along rays (...,6,2)."""
+    equations = vectors[..., :2] - rays * vectors[..., 2:]
+    return equations.reshape(*equations.shape[:-2], 12)
+
+
+def _of_translations(rays: Array, tau: Array) -> Array:
+    """Return (h,12,6): the coefficients of C and t."""
+    moved = np.broadcast_to(_AXES[:, None, None], (3, len(rays), 6, 3))
+    columns = [_seen(axis * r, rays) for r in (1.0, tau[..., None]) for axis in moved]
+    return np.stack(columns, axis=-1)
+
+
+def _eliminated(points: Array, rays: Array, tau: Array) -> Array:
+    """Return the coefficients (h,6,4,4) of A(v): rows; w and a constant; 1 and v."""
+    r = tau[..., None]
+    turned = [points, *(np.cross(axis, points) for axis in _AXES)]  # by 1 and v
+    turns = [[r * np.cross(axis, one) for one in turned] for axis in _AXES]
+    whole = np.array([[_seen(one, rays) for one in column] for column in (*turns, turned)])
+    free = np.linalg.qr(_of_translations(rays, tau), mode="complete")[0][:, :, 6:]
+    return np.einsum("her,jkhe->hrjk", free, whole, optimize=True)
+
+
+def _candidates(a: Array, bound: float) -> tuple[IntArray, Array]:
+    """Return the places of samples and v (c,3) where A(v) drops rank."""
+    minors = a[:, :, 0]
+    for size, (rows, others, products) in enumerate(_EXPANSIONS, start=2):
+        last = a[:, rows, size - 1] * _SIGNS[:size]
+        by_linear = last.swapaxes(-1, -2) @ minors[:, others]
+        minors = by_linear.reshape(*by_linear.shape[:2], -1) @ products
+    quartic = -np.linalg.pinv(minors[..., SOLUTIONS:]) @ minors[..., :SOLUTIONS]
+    times_y = np.empty((len(a), SOLUTIONS, SOLUTIONS))
+    lower = _TIMES_Y < SOLUTIONS
+    times_y[:, lower] = np.eye(SOLUTIONS)[_TIMES_Y[lower]]
+    times_y[:, ~lower] = quartic[:, _TIMES_Y[~lower] - SOLUTIONS]
+    values, vectors = np.linalg.eig(times_y)
+    found, number = np.nonzero((values.imag == 0.0) & (np.abs(values.real) <= bound))
+    vector = vectors[found, :, number].real
+    v = vector[:, 1:4] / vector[:, :1]
+    near = np.linalg.norm(v, axis=1) < _NEAR * bound  # nor NaN
+    return found[near], v[near]
+
+
+def _polished(a: Array, v: Array) -> tuple[Array, Array, Array]:
+    """Return v, w (c,3) after Newton steps on ``A(v) [w; 1] = 0``, and the last step's length."""
+    step = np.zeros((len(v), 6))
+    rows = a[..., 0] + np.einsum("crjk,ck->crj", a[..., 1:], v)
+    w = -(np.linalg.pinv(rows[..., :3]) @ rows[..., 3:])[..., 0]
     for _ in range(_NEWTON_STEPS):
-        residual = [dot(row[:3], w) + row[3] for row in rows]
-        by_v = [
-            [dot([entry[1 + i] for entry in row[:3]], w) + row[3][1 + i] for row in a]
-            for i in range(3)
-        ]
-        by_w = [[row[j] for row in rows] for j in range(3)]
-        step = least_squares([*by_v, *by_w], residual)
-        v = [x - d for x, d in zip(v, step[:3], strict=True)]
-        w = [x - d for x, d in zip(w, step[3:], strict=True)]
-        rows = matrix(v)
-    return v, w, dot(step, step)
+        factors = np.column_stack([w, np.ones(len(w))])
+        by_v = np.einsum("crjk,cj->crk", a[..., 1:], factors)
+        both = np.concatenate([by_v, rows[..., :3]], axis=-1)
+        step = (np.linalg.pinv(both) @ (rows @ factors[..., None]))[..., 0]
+        v, w = v - step[:, :3], w - step[:, 3:]
+        rows = a[..., 0] + np.einsum("crjk,ck->crj", a[..., 1:], v)
+    return v, w, np.linalg.norm(step, axis=1)
 
 
-def _solution(values: list[Lanes]) -> Vector:
-    """Return the model of one eigenvalue, and v; NaN where it is none."""
-    sample = Sample(values[: _INPUTS + _A], SAMPLE_SIZE)
-    relations, (y, bound) = values[-_CANDIDATE:-2], values[-2:]
-    a = [[sample.state[16 * i + 4 * j : 16 * i + 4 * j + 4] for j in range(4)] for i in range(6)]
-    v, w, change = _polish(a, rank_drop.solution_at(relations, y))
-    valid = (change < _CONVERGED**2) & (dot(v, v) < bound * bound)
-    v = [select(valid, x, math.nan) for x in v]
-    points = []
-    for x, r in zip(sample.points, sample.tau, strict=True):
-        seen = [p + d for p, d in zip(x, cross(v, x), strict=True)]
-        points.append([p + r * d for p, d in zip(seen, cross(w, seen), strict=True)])
-    depth = linear.depth_column(sample.rays)
-    (cx, tx), (cy, ty), (cz, tz) = linear.solve(
-        [linear.lateral_column(SAMPLE_SIZE), [-r for r in sample.tau]],
-        [depth, linear.times_row(depth, sample.tau)],
-        linear.right_hand_side(points, sample.rays),
-    )
-    rotation = [x for row in linear.fold(sample.rotation, v) for x in row]
-    return [*rotation, cx, cy, cz, *w, tx, ty, tz, *v]
+def _translations(
+    points: Array, rays: Array, tau: Array, v: Array, w: Array
+) -> tuple[Array, Array]:
+    """Return C and t (c,3)."""
+    turned = points + np.cross(v[:, None], points)
+    known = _seen(turned + tau[..., None] * np.cross(w[:, None], turned), rays)
+    both = -(np.linalg.pinv(_of_translations(rays, tau)) @ known[..., None])[..., 0]
+    return both[:, :3], both[:, 3:]
 
 
-_begin_lanes = traced(_begin, _INPUTS)
-_solution_lanes = traced(_solution, _INPUTS + _A, _CANDIDATE)
-
-
-@inlined
-def _nearest_first(solutions: Array, count: int, lane: int) -> None:
-    """Order a lane's solutions by length of v; those that are none, and NaN, come last."""
-    for k in range(count):
-        best, shortest = k, np.inf
-        for j in range(k, count):
-            v = (j * _SOLUTION + MODEL_SIZE) * LANES + lane
-            length = solutions[v] ** 2 + solutions[v + LANES] ** 2 + solutions[v + 2 * LANES] ** 2
-            if length < shortest:
-                best, shortest = j, length
-        if best == k:
-            continue
-        for i in range(lane, _SOLUTION * LANES, LANES):
-            one, other = k * _SOLUTION * LANES + i, best * _SOLUTION * LANES + i
-            solutions[one], solutions[other] = solutions[other], solutions[one]
-
-
-@entry
-def _solve(
-    points: Array2, rays: Array2, tau: Array1, samples: IntArray2, rotations: Array3, bound: float,
-    models: Out[Array3], turns: Out[Array3],
-) -> None:  # fmt: skip
-    """Solve a batch as :func:`solve_batch`; ``turns`` (20,3,h) gets v, or is empty (0,3,1)."""
-    models[:] = np.nan
-    work = lane_array(_INPUTS + _A)
-    room = lane_array(rank_drop.WORK)
-    candidate = lane_array(_CANDIDATE)
-    multiplication = lane_array((SOLUTIONS + 1) ** 2)
-    eigenvalues = lane_array(SOLUTIONS)
-    counts = np.zeros(LANES, np.int64)
-    solutions = lane_array(SOLUTIONS * _SOLUTION)
-    candidate[-LANES:] = bound
-    for start in range(0, len(samples), LANES):
-        gather(points, rays, tau, samples, rotations, start, work)
-        _begin_lanes(work, work)
-        rank_drop.find_relations(work, _INPUTS, room, candidate)
-        rank_drop.fill_multiplication(candidate, multiplication)
-        reduce_to_hessenberg(multiplication, SOLUTIONS, room)
-        real_eigenvalues(multiplication, SOLUTIONS, bound, room, counts, eigenvalues)
-        count = counts.max()
-        for k in range(count):
-            for lane in range(LANES):
-                value = eigenvalues[k * LANES + lane] if k < counts[lane] else np.nan
-                candidate[RELATIONS * LANES + lane] = value
-            _solution_lanes(work, candidate, solutions[k * _SOLUTION * LANES :])
-        for lane in range(LANES):
-            _nearest_first(solutions, count, lane)
-        for k in range(count):
-            scatter(solutions, k * _SOLUTION, start, models[k])
-        for k in range(min(count, len(turns))):
-            for lane in range(min(LANES, len(samples) - start)):
-                for i in range(3):
-                    turns[k, i, start + lane] = solutions[
-                        (k * _SOLUTION + MODEL_SIZE + i) * LANES + lane
-                    ]
+def _nearest_rotations(v: Array) -> Array:
+    """Return the rotations (c,3,3) nearest to ``I + [v]x``: about v, by the arctangent of |v|."""
+    cosine = 1.0 / np.sqrt(1.0 + np.sum(v**2, axis=1))[:, None, None]
+    cross = np.cross(v[:, None], _AXES).swapaxes(1, 2)
+    turned: Array = _AXES + cosine * cross + cosine**2 / (1.0 + cosine) * (cross @ cross)
+    return turned
 
 
 def solve_batch(
@@ -193,5 +201,11 @@ def solve_batch(
 
     The solutions of a sample come first, those nearest to the initial rotation before others.
     """
-    # Not a kernel itself: Numba would optimize all of the code once more.
-    _solve(points, rays, tau, samples, rotations, float(bound), models, np.empty((0, 3, 1)))
+    models[:] = np.nan
+    for start in range(0, len(samples), _BLOCK):
+        rows = samples[start : start + _BLOCK]
+        initial = rotations[start : start + _BLOCK] if len(rotations) > 1 else rotations
+        seen = points[rows] @ initial.swapaxes(1, 2)
+        sample, number, v, w, c, t = find_solutions(seen, rays[rows], tau[rows], bound)
+        rotated = _nearest_rotations(v) @ (initial[sample] if len(rotations) > 1 else initial)
+        models[number, :, start + sample] = np.hstack([rotated.reshape(-1, 9), c, w, t])

@@ -138,26 +138,13 @@ def problems(h, seed, *, physical, rotation=30.0, translation=0.3, error=6.0, no
     return SimpleNamespace(**{name: x[settled] for name, x in vars(problem).items()})
 
 
-def solutions(p, bound=BOUND):
-    """v, C, w, t, each (h,20,3), before I + [v]x is replaced by the nearest rotation."""
-    h = len(p.points)
-    models, turns = np.empty((20, 18, h)), np.full((20, 3, h), np.nan)
-    r6p._solve(
-        np.ascontiguousarray(p.points).reshape(-1, 3), np.ascontiguousarray(p.rays).reshape(-1, 2),
-        np.ascontiguousarray(p.tau).ravel(), np.arange(6 * h).reshape(h, 6), np.eye(3)[None],
-        bound, models, turns,
-    )  # fmt: skip
-    found = np.moveaxis(models, (2, 0), (0, 1))
-    v = np.where(np.isnan(found[..., :1]), np.nan, np.moveaxis(turns, (2, 0), (0, 1)))
-    return v, found[..., 9:12], found[..., 12:15], found[..., 15:]
-
-
-def check_residuals(p, v, c, w, t, limit=1e-9):
-    sample, number = np.nonzero(np.isfinite(v[..., 0]))
-    one = SimpleNamespace(points=p.points[sample], rays=p.rays[sample], tau=p.tau[sample])
-    value = residuals(one, *(x[sample, number] for x in (v, c, w, t)))
-    assert np.abs(value).max() < limit
-    return sample, v[sample, number]
+def solutions(p, limit=1e-9):
+    """Samples (m,) and v (m,3), before I + [v]x is replaced by the nearest rotation."""
+    found = r6p.find_solutions(p.points, p.rays, p.tau, BOUND)
+    of = found.sample
+    one = SimpleNamespace(points=p.points[of], rays=p.rays[of], tau=p.tau[of])
+    assert np.abs(residuals(one, found.v, found.c, found.w, found.t)).max() < limit
+    return of, found.v
 
 
 def distances(sample, v, others, other_v):
@@ -196,7 +183,7 @@ def test_all_real_solutions_are_found_and_nothing_else(family):
     else:
         p = problems(1000, 7, **FAMILIES[family])
     expected = oracle(p, np.random.default_rng(8))
-    found = check_residuals(p, *solutions(p))
+    found = solutions(p)
     assert len(expected[0]) > 0.05 * len(p.points)
     assert (np.linalg.norm(found[1], axis=1) < BOUND).all()
     assert np.mean(distances(*expected, *found) < 1e-6) >= 0.999
@@ -205,9 +192,9 @@ def test_all_real_solutions_are_found_and_nothing_else(family):
     assert abs(len(found[0]) - len(expected[0])) <= 0.001 * len(expected[0])
 
 
-@pytest.mark.parametrize(("off", "least", "most"), [(0.0, 0.25, 0.5), (0.02, 0.0, 0.0)])
-def test_a_plane_is_solved_from_the_true_orientation_alone(off, least, most):
-    """As docs/solvers.md says: 30 to 40 % of exact samples, none from 1 degree off."""
+@pytest.mark.parametrize(("off", "least", "error"), [(0.0, 0.95, 1e-6), (0.02, 0.75, 0.005)])
+def test_a_plane_is_solved_near_the_true_orientation(off, least, error):
+    """As docs/solvers.md says; the error is that of the model, the square of the angle."""
     rng, count = np.random.default_rng(0), 200
     points = rng.uniform(-1.0, 1.0, (count, 6, 3)) * [1.0, 1.0, 0.0]
     tau = rng.uniform(-0.5, 0.5, (count, 6))
@@ -215,10 +202,11 @@ def test_a_plane_is_solved_from_the_true_orientation_alone(off, least, most):
     c, w, t = (rng.normal(0.0, 0.1, (count, 1, 3)) for _ in range(3))
     turned = np.einsum("hij,hnj->hni", true.as_matrix(), points)
     seen = turned + tau[..., None] * (np.cross(w, turned) + t) + c + [0.0, 0.0, 4.0]
-    start = Rotation.from_rotvec(off * np.array([1.0, 0.0, 0.0])) * true
+    start = (Rotation.from_rotvec(off * np.array([1.0, 0.0, 0.0])) * true).as_matrix()
     rays = seen[..., :2] / seen[..., 2:]
-    found = solve_minimal("r6p", points, rays, tau, rotation=start.as_matrix())[0]
+    solutions(SimpleNamespace(points=points @ start.swapaxes(1, 2), rays=rays, tau=tau))
+    found = solve_minimal("r6p", points, rays, tau, rotation=start)[0]
     apart = np.linalg.norm(found - true.as_matrix()[:, None], axis=(2, 3))
     solved = np.any(np.isfinite(apart), axis=1)
-    assert least <= np.mean(solved) <= most
-    assert np.all(np.nanmin(apart[solved], axis=1, initial=np.inf) < 1e-6)
+    assert np.mean(solved) > least
+    assert np.quantile(np.nanmin(apart[solved], axis=1), 0.9) < error
