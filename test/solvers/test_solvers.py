@@ -132,7 +132,8 @@ def models_of(name, *samples):
 
 @pytest.mark.parametrize("name", list(SOLVERS))
 def test_no_sample_breaks_a_solver_or_its_neighbours(name):
-    samples = degenerate_samples(find_solver(name).sample_size, 100_000, seed=13)
+    count = 10_000 if name == "r6p" else 100_000  # in NumPy, slower
+    samples = degenerate_samples(find_solver(name).sample_size, count, seed=13)
     found = 0
     for part in zip(*(np.array_split(values, 20) for values in samples), strict=True):
         with warnings.catch_warnings():
