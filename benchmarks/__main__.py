@@ -64,7 +64,6 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   fuzzing                          wrong input for everything that reads
   load                             live nodes under load
   load.robot                       a live node on a robot: occlusions, odometry at 200 Hz
-  start                            memory and time of a start of the node
   page                             what a bench prints, into the docs
 """
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What minimal problems cost.
 
-Of frames: ``python -m benchmarks.frames times``; of a start: ``python -m benchmarks.start``.
+Of frames: ``python -m benchmarks.frames times``.
 """
 
 from __future__ import annotations
