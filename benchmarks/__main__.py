@@ -57,7 +57,6 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   integrity                        the chance of a wrong pose or map: reliability, ROC
   rigs                             several cameras, against their bounds
   real                             videos of real cameras; real gyro BAG: before a gyroscope
-  gross                            grossly wrong lenses and maps: what is published
   faulty_gyroscopes                gyroscopes that are wrong, beside the camera alone
   kinds                            faults that no frame's model has: what is noticed
   mapping                          refined maps and surveyed markers

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rs_localizer as rsl
-from benchmarks.gross import frame
+from benchmarks.frames.gross import frame
 from rs_localizer.config import CalibrationErrors
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.types import Failure

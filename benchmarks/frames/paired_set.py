@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 import rs_localizer as rsl
-from benchmarks import gross
 from benchmarks.data import GLOBAL_SHUTTER_TAGS
+from benchmarks.frames import gross
 from benchmarks.frames.conditions import (
     HAND,
     NARROW,
@@ -159,7 +159,7 @@ def judged(seed: int, only: Sequence[str] = ()) -> Iterator[tuple[str, Judged]]:
 
 
 def _gross(scene: str, fault: str, frames: int, seed: int) -> Judged:
-    """Frames of ``benchmarks.gross``."""
+    """Frames of :mod:`benchmarks.frames.gross`."""
     key = zlib.crc32(f"{scene}/{fault}".encode())
     random, figures, reasons = np.random.default_rng([seed, key]), [], []
     for k in range(frames):

@@ -11,7 +11,7 @@ elimination:
 1. The translations are linear; an orthogonal transformation of the twelve equations removes
    them. Six remain, bilinear in v and w: ``A(v) [w; 1] = 0``, A 6x4 with linear entries.
 2. All fifteen 4x4 minors of A vanish at up to 20 v: quartics with 35 monomials. They express
-   those of degree four by the 20 others, and multiplication by v_y thereby becomes a 20x20 matrix
+   those of degree four by the 20 others. Multiplication by v_y thereby becomes a 20x20 matrix,
    whose eigenvectors are these 20 monomials at the solutions (Cox, Little, O'Shea, "Using
    Algebraic Geometry", 2005, sec. 2.4). Only real eigenvalues in range are followed up.
 3. v follows from the eigenvector, w from the null vector of A(v), and Newton steps on the six

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from benchmarks.frames import paired_set
+from benchmarks.frames.gross import frame
 from benchmarks.frames.judged import far_off, judge
-from benchmarks.gross import frame
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.estimation.left_out import as_nearest

@@ -48,7 +48,7 @@ def test_the_set_has_what_issues_name():
     counts = dict.fromkeys(paired_set.SPOILT, 0)
     for number, one in paired_set.spoilt():
         counts[one.bench] += number
-    # Wrong lenses and parts of the map that moved are of benchmarks.gross.
+    # Wrong lenses and parts of the map that moved are of benchmarks.frames.gross.
     assert counts == {"lens": 0, "garbage": 44, "bodies": 32, "facades": 20, "near": 40}
 
 

@@ -1,8 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Grossly wrong cameras and maps: how many poses are published that are far beyond their regions.
-
-python -m benchmarks.gross --frames 300
+"""Frames of grossly wrong cameras and maps, for the paired set.
 
 Single frames of a wall, the corner of two, a volume, and ten markers on two walls, seen from 2 m by
 a hand-held camera; its focal length is off by 0.5 to 2, a binning or ROI counted twice, or half of
@@ -11,24 +9,18 @@ the map was moved. Nothing of the package makes the frames.
 
 from __future__ import annotations
 
-import argparse
-import sys
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import cv2
 import numpy as np
 
 import rs_localizer as rsl
-from benchmarks.experiments.results import Table
 from rs_localizer.core.arrays import Array
 
 Random = np.random.Generator
 
 _READOUT, _NOISE, _SIZE, _FOCAL = 0.02, 0.1, (640, 480), 500.0
 _CENTRE = np.array([319.5, 239.5])
-# A pose beyond so many standard deviations is no chance.
-_FAR = 5.0
 
 
 def _turned(vector: Array) -> Array:
@@ -64,7 +56,6 @@ def _markers(random: Random, count: int) -> Array:
 SCENES: dict[str, Callable[[Random, int], Array]] = {
     "wall": _wall, "corner": _corner, "volume": _volume, "markers": _markers,
 }  # fmt: skip
-FAULTS = ("right", "a tenth wrong", "focal length", "binned twice", "ROI twice", "half moved")
 
 
 def frame(scene: str, fault: str, random: Random) -> tuple[rsl.Camera, Array, Array, Array]:
@@ -102,58 +93,3 @@ def frame(scene: str, fault: str, random: Random) -> tuple[rsl.Camera, Array, Ar
         points[half] = (points[half] - pivot) @ turn.T + pivot + shift
     K = np.array([[focal, 0.0, centre[0]], [0.0, focal, centre[1]], [0.0, 0.0, 1.0]])
     return rsl.Camera(*_SIZE, K=K, readout_time=_READOUT), points, pixels, rotation
-
-
-def deviations(result: rsl.Estimate, rotation: Array) -> float:
-    """How far a pose is off, in standard deviations of its turn or of its position."""
-    off = cv2.Rodrigues(result.rotation @ rotation.T)[0][:, 0]
-    place = result.rotation @ result.position
-    errors, covariance = np.array([off, place]), result.covariance
-    blocks = (covariance[:3, :3], covariance[3:6, 3:6])
-    return max(
-        float(np.linalg.norm(e) / np.sqrt(np.trace(c))) for e, c in zip(errors, blocks, strict=True)
-    )
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.gross", description=__doc__)
-    parser.add_argument("--frames", type=int, default=300)
-    parser.add_argument("--only", nargs="+", default=[])
-    parser.add_argument("--seed", type=int, default=0, help="other frames of the same kinds")
-    options = parser.parse_args()
-    kinds = [one for one in FAULTS if any(_has(scene, one, options.only) for scene in SCENES)]
-    rows: list[tuple[str, ...]] = []
-    for scene in SCENES:
-        cells = []
-        for fault in kinds:
-            name = f"{scene}/{fault}"
-            if not _has(scene, fault, options.only):
-                cells.append("")
-                continue
-            kind = (list(SCENES).index(scene), FAULTS.index(fault))
-            random = np.random.default_rng([*kind, options.seed])
-            far, published, reasons = 0, 0, Counter[str]()
-            for _ in range(options.frames):
-                camera, points, pixels, rotation = frame(scene, fault, random)
-                result = rsl.Localizer(camera).localize(points, pixels)
-                if result:
-                    published += 1
-                    far += deviations(result, rotation) > _FAR
-                else:
-                    reasons[str(result.reason)] += 1
-            why = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
-            sys.stderr.write(f"{name:24} {published:9} {far:9}  {why}\n")
-            cells.append(f"{published}, {far}")
-        if any(cells):
-            rows.append((scene, *cells))
-    heads = [kind.replace("a tenth wrong", "tenth wrong") for kind in kinds]
-    print(Table((f"published, beyond {_FAR:g}", *heads), rows).text())
-    return 0
-
-
-def _has(scene: str, fault: str, words: Sequence[str]) -> bool:
-    return all(word in f"{scene}/{fault}" for word in words)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
