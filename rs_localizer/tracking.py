@@ -4,7 +4,7 @@
 
 A single image shows the camera's velocity only through the shutter, and the linear part badly; two
 poses a frame apart show it well. The tracker combines both. Its state is one trajectory through the
-last frames (:mod:`rs_localizer.estimation.motion_window`). Accelerations fade within an image or
+last frames (:mod:`rs_localizer.estimation.window`). Accelerations fade within an image or
 two while new ones come (Singer, "Estimating optimal tracking filter performance for manned
 maneuvering targets", 1970); their size is learnt. The trajectory predicts each frame and is the
 prior of its maximum a posteriori estimate. What the points add to the prior joins the window. A
@@ -41,29 +41,27 @@ from rs_localizer.core.state import (
 )
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import ErrorModes
-from rs_localizer.estimation.motion_model import (
+from rs_localizer.estimation.prior import Prior
+from rs_localizer.estimation.window import (
     FADING,
-    acceleration_covariance,
-    mean_turn,
-    unshaken,
-)
-from rs_localizer.estimation.motion_window import (
     LENGTH,
     Gaussian,
     MotionSample,
     MotionWindow,
+    PredictionErrors,
+    acceleration_covariance,
     estimate_at,
     gaussian_of,
+    mean_turn,
     motion_of,
     predicted_estimate,
     sample_of,
     told_of,
+    unshaken,
 )
-from rs_localizer.estimation.prior import Prior
 from rs_localizer.integrity import Integrity
 from rs_localizer.lens_watch import LensWatch
 from rs_localizer.localizer import Localizer
-from rs_localizer.prediction_errors import PredictionErrors
 from rs_localizer.repeated_images import RepeatedImages, coasting
 from rs_localizer.shutter_watch import FAR_OFF, ShutterWatch
 from rs_localizer.solvers.table import find_solver

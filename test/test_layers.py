@@ -20,7 +20,7 @@ TRACED = ("core/simd/tracing.py",)
 # What each part may import besides itself; every part has a row.
 METHOD = {
     *("core", "config", "solvers", "estimation", "inertial", "integrity", "localizer"),
-    *("lens_watch", "prediction_errors", "repeated_images", "shutter_watch", "tracking"),
+    *("lens_watch", "repeated_images", "shutter_watch", "tracking"),
 }
 MAY_IMPORT: dict[str, set[str]] = {
     "process": set(),
@@ -33,7 +33,6 @@ MAY_IMPORT: dict[str, set[str]] = {
     "inertial": {"core", "estimation", "native"},
     "localizer": {"core", "config", "solvers", "estimation"},
     "integrity": {"core", "estimation"},
-    "prediction_errors": {"core", "estimation"},
     "repeated_images": {"core", "estimation"},
     "lens_watch": {"core"},
     "shutter_watch": {"core", "estimation"},

@@ -11,10 +11,12 @@ from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from rs_localizer.config import Acceleration
+from rs_localizer.core import shutter
+from rs_localizer.core.shutter import carried, numbers_of
 from rs_localizer.core.state import step_between
-from rs_localizer.estimation.motion_model import acceleration_covariance, predict
 from rs_localizer.estimation.prior import state_in
 from rs_localizer.estimation.refine import apply_step
+from rs_localizer.estimation.window import acceleration_covariance
 
 READOUT = 0.03
 FADING = 0.03  # s
@@ -40,6 +42,11 @@ def start(accelerations):
     )
 
 
+def predict(vector, spread, readouts, fading):
+    later, transport = carried(numbers_of(motion_of(vector)), readouts, fading)
+    return shutter.motion_of(later), transport @ spread @ transport.T
+
+
 def derivatives(function, size, h=1e-6):
     return np.stack([(function(h * e) - function(-h * e)) / (2 * h) for e in np.eye(size)], axis=1)
 
@@ -48,7 +55,7 @@ def derivatives(function, size, h=1e-6):
 def test_accelerations_fade_and_leave_their_velocity_and_way(readouts):
     fading = FADING / READOUT
     first = motion_of(start(ACCELERATIONS))
-    later, _ = predict(first, np.eye(18), readouts, fading)
+    later, _ = predict(start(ACCELERATIONS), np.eye(18), readouts, fading)
 
     def left(s):
         return np.exp(-s / fading)
@@ -77,11 +84,11 @@ def test_errors_are_carried_along_to_first_order(readouts):
     fading = FADING / READOUT
     factor = 0.1 * np.random.default_rng(3).normal(size=(18, 18))
     spread, first = factor @ factor.T, start(np.zeros(6))
-    later, covariance = predict(motion_of(first), spread, readouts, fading)
+    later, covariance = predict(first, spread, readouts, fading)
 
     def moved(step):
         """Where the prediction goes when the start moves."""
-        other, _ = predict(motion_of(apply_step(first, step)), spread, readouts, fading)
+        other, _ = predict(apply_step(first, step), spread, readouts, fading)
         return step_between(state(later), state(other))
 
     jacobian = derivatives(moved, 18)

@@ -81,9 +81,9 @@ SWITCHES: dict[str, tuple[Switch, ...]] = {
     "by-chance": (Switch("rs_localizer.estimation.left_out:_by_chance", _always(None)),),
     "left-out": (Switch("rs_localizer.localizer:left_out", _always(LeftOut())),),
     # Tracking.
-    "window": (Switch("rs_localizer.estimation.motion_window:LENGTH", lambda old: 2),),
+    "window": (Switch("rs_localizer.estimation.window:LENGTH", lambda old: 2),),
     "learnt-accelerations": (
-        Switch("rs_localizer.estimation.motion_window:MotionWindow._learnt",
+        Switch("rs_localizer.estimation.window:MotionWindow._learnt",
                lambda old: lambda self, deviations, scores: deviations),
     ),
 }  # fmt: skip

@@ -38,8 +38,8 @@ from rs_localizer.core.state import (
     step_between,
 )
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.motion_window import MotionSample
 from rs_localizer.estimation.prior import Prior, state_in
+from rs_localizer.estimation.window import MotionSample
 from rs_localizer.inertial.gravity import gravity_seen
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.status import InertialSettings, InertialStatus, Unused

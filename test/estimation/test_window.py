@@ -10,7 +10,9 @@ import rs_localizer as rsl
 from rs_localizer.config import Acceleration
 from rs_localizer.core.state import step_between
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.motion_window import (
+from rs_localizer.estimation.prior import Prior, motion_terms, state_in, with_motion
+from rs_localizer.estimation.refine import apply_step
+from rs_localizer.estimation.window import (
     LENGTH,
     Gaussian,
     MotionSample,
@@ -19,8 +21,6 @@ from rs_localizer.estimation.motion_window import (
     motion_of,
     sample_of,
 )
-from rs_localizer.estimation.prior import Prior, motion_terms, state_in, with_motion
-from rs_localizer.estimation.refine import apply_step
 
 FADING, PERIOD = 0.03, 1.0 / 30.0  # s
 SPAN = 0.03

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The motion over the last frames: one trajectory, whose accelerations' deviations are learnt.
 
-Frames are samples of a trajectory whose accelerations fade while new ones come
-(:mod:`rs_localizer.estimation.motion_model`). A frame's points, beside what was known before, give
-a Gaussian ``exp(-d' L d / 2 + g' d)`` of the step ``d`` from the frame's estimate. A filter runs
-forward through the window, and a smoother back (Rauch et al., "Maximum likelihood estimates of
-linear dynamic systems", 1965).
+Frames are samples of a trajectory whose accelerations fade while new ones come (Singer, "Estimating
+optimal tracking filter performance for manned maneuvering targets", 1970). A frame's points, beside
+what was known before, give a Gaussian ``exp(-d' L d / 2 + g' d)`` of the step ``d`` from the
+frame's estimate. A filter runs forward through the window, and a smoother back (Rauch et al.,
+"Maximum likelihood estimates of linear dynamic systems", 1965).
 
 ``P`` is the covariance of the prediction, to which the transition adds ``Q`` for the accelerations
 of one axis. ``x`` is the smoothed step from the prediction, and ``V`` its covariance. The score of
@@ -16,19 +16,29 @@ the variance of these accelerations is
 
 A variance ``r`` times as large makes it ``(r - 1) tr(Q M Q M)`` in the mean. So the scales of a
 tripod, of a hand and of a car are found within a few frames, from below and from above.
+
+Real accelerations last longer than this model's, and those of noise end at once: a tenth of a
+second ahead it claims too small an error for the first and too large a one for the second. So the
+motions of the last images are extrapolated to each new one (:class:`PredictionErrors`).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from rs_localizer.config import Acceleration
+from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, Array1, Array2, Array3
+from rs_localizer.core.gyro_rotation import GyroRotation
+from rs_localizer.core.shake import MIDDLE_RATES, MIDDLE_VALUES
 from rs_localizer.core.shutter import Motion, carried
 from rs_localizer.core.state import (
+    ANGULAR,
+    MOTION_PARAMETERS,
     PARAMETERS,
     STATE_ANGULAR,
     STATE_ANGULAR_ACCELERATION,
@@ -36,17 +46,22 @@ from rs_localizer.core.state import (
     STATE_LINEAR_ACCELERATION,
     STATE_SIZE,
     STATE_TRANSLATION,
+    TURN,
     rotation_of,
     step_between,
 )
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.motion_model import FADING, mean_turn, singer, unshaken
 from rs_localizer.estimation.prior import PriorTerms, add_prior, state_in
 from rs_localizer.estimation.refine import apply_step, inverted
 from rs_localizer.native import entry, kernel
 
 LENGTH = 6
 """Frames of the window: at 30 Hz a fifth of a second, in which a hand changes its mind."""
+# Time (s) in which accelerations fade. Of 0.1, 0.05 and 0.03 the last one has the least errors of
+# turn rates of a phone in a car and of Aria's head, and the most of them inside.
+FADING = 0.03
+# Below this part of the time of fading the closed form of the noise is rounding errors.
+_SHORT = 0.03
 # Weight of a transition's score by its age, in transitions.
 _FORGETTING = 0.8
 # Numbers that must have told of a scale before it follows them halfway.
@@ -57,6 +72,23 @@ _LEAST_CHANGE, _MOST_CHANGE, _ROUNDS = 0.2, 25.0, 2
 _LEAST_SCALE, _MOST_SCALE = 0.03, 100.0
 # Who turns about one axis turns a little about the others: of the largest deviation.
 _LEAST_SHARE = 0.3
+# Horizons of predictions, as parts of the longest one: at 30 Hz and 0.1 s, one, two, three images.
+_KNOTS = np.array([1.0, 2.0, 3.0]) / 3.0
+# Weight of the newest image, so that some two dozen images count; weight of the first one.
+_NEWEST, _FIRST = 0.08, 0.5
+# Largest ratio of squared errors that one image may contribute.
+_MOST_RATIO = 20.0
+# Smallest factor if the window has learnt its accelerations, and beside a gyroscope, where it has
+# not.
+_LEAST, _LEAST_UNLEARNT = 1.0, 0.1
+# A factor rests on some twelve independent numbers, so regions follow F(3, 12) instead of
+# chi-squared: the ratio of their 95 % bounds.
+_FEW = 1.3
+# Derivatives of a motion without its vibration by motion and coefficients.
+_UNSHAKEN = np.eye(PARAMETERS, PARAMETERS + 3 * len(MIDDLE_VALUES))
+_UNSHAKEN[TURN, PARAMETERS:] = -np.kron(MIDDLE_VALUES, np.eye(3))
+_UNSHAKEN[ANGULAR, PARAMETERS:] = -np.kron(MIDDLE_RATES, np.eye(3))
+_ORIGIN = np.zeros(3)
 
 
 class Gaussian(NamedTuple):
@@ -77,13 +109,14 @@ class MotionSample(NamedTuple):
 
 
 class _Solved(NamedTuple):
-    predicted: Array  # (n,24)
-    predictions: Array  # (n,18,18) their covariances
-    transports: Array  # (n,18,18) from the sample before
-    filtered: Array  # (n,24)
-    covariances: Array  # (n,18,18)
-    smoothed: Array  # (n,24)
-    smoothed_covariances: Array  # (n,18,18)
+    """Filter and smoother of n samples, behind the start (n + 1 rows)."""
+
+    predicted: Array  # (24,) of the last one
+    prediction: Array  # (18,18) its covariance
+    filtered: Array  # (n+1,24)
+    covariances: Array  # (n+1,18,18)
+    smoothed: Array  # (n+1,24)
+    smoothed_covariances: Array  # (n+1,18,18)
     scores: Array  # (4,3) of the deviations: squared, expected, information
 
 
@@ -111,7 +144,7 @@ class MotionWindow:
         cls, start: Gaussian, acceleration: Acceleration, readout_share: float = 0.0
     ) -> MotionWindow:
         """Begin with a motion of which no other frame tells."""
-        configured = np.repeat([acceleration.angular, acceleration.linear], (3, 1)).astype(float)
+        configured = _deviations(acceleration)
         return cls(start, configured, configured.copy(), readout_share=readout_share)
 
     @property
@@ -130,9 +163,9 @@ class MotionWindow:
         if self.solved is None:
             return 0.0
         solved, sample = self.solved, self.samples[-1]
-        moved = step_between(solved.predicted[-1], solved.filtered[-1])
+        moved = step_between(solved.predicted, solved.filtered[-1])
         pulled = step_between(sample.state, solved.filtered[-1])
-        squared = moved @ np.linalg.solve(solved.predictions[-1], moved)
+        squared = moved @ np.linalg.solve(solved.prediction, moved)
         squared += pulled @ (sample.information @ pulled - 2.0 * sample.gradient)
         return float(squared)
 
@@ -143,17 +176,21 @@ class MotionWindow:
         """Return the motion so many frames before the last one, given all frames."""
         if self.solved is None:
             return self.start
-        row = len(self.samples) - 1 - frames
-        if row < 0:
-            return self._smoothed_start()
-        solved = self.solved
+        row = len(self.samples) - frames
         return Gaussian(
-            self.samples[row].time_ns, solved.smoothed[row], solved.smoothed_covariances[row]
+            self.times[row], self.solved.smoothed[row], self.solved.smoothed_covariances[row]
         )  # fmt: skip
 
     def after(self, time_ns: int) -> Gaussian:
         """Return the motion at a time after the last frame."""
-        return _moved(self.newest, time_ns, self.deviations, self.readout_share)
+        newest = self.newest
+        seconds = 1e-9 * (time_ns - newest.time_ns)
+        if seconds == 0.0:
+            return newest
+        state, covariance, _ = _predicted(
+            newest.state, newest.covariance, seconds, self.deviations, self.readout_share
+        )
+        return Gaussian(time_ns, state, covariance)
 
     def at(self, time_ns: int) -> Gaussian | None:
         """Return the motion at a time, given all frames; None before the first of them."""
@@ -179,7 +216,7 @@ class MotionWindow:
         if len(samples) >= LENGTH:
             assert self.solved is not None
             first, solved = samples[0], self.solved
-            start = Gaussian(first.time_ns, solved.filtered[0], solved.covariances[0])
+            start = Gaussian(first.time_ns, solved.filtered[1], solved.covariances[1])
             samples = samples[1:]
         deviations = self.deviations
         for _ in range(_ROUNDS):
@@ -197,28 +234,6 @@ class MotionWindow:
         changed[:3] = np.maximum(changed[:3], _LEAST_SHARE * changed[:3].max())
         learnt: Array = changed
         return learnt
-
-    def _smoothed_start(self) -> Gaussian:
-        solved, start = self.solved, self.start
-        assert solved is not None
-        return Gaussian(
-            start.time_ns,
-            *_back(
-                start.state, start.covariance, solved.predicted[0], solved.predictions[0],
-                inverted(solved.predictions[0]), solved.transports[0], solved.smoothed[0],
-                solved.smoothed_covariances[0],
-            ),
-        )  # fmt: skip
-
-
-def _moved(motion: Gaussian, time_ns: int, deviations: Array, readout_share: float) -> Gaussian:
-    seconds = 1e-9 * (time_ns - motion.time_ns)
-    if seconds == 0.0:
-        return motion
-    state, covariance, _ = _predicted(
-        motion.state, motion.covariance, seconds, deviations, readout_share
-    )
-    return Gaussian(time_ns, state, covariance)
 
 
 def _solved(
@@ -245,17 +260,10 @@ def _predicted(
         state[15:18].copy(), state[18:21].copy(), state[21:24].copy(),
     )  # fmt: skip
     later, transport = carried(numbers, seconds, FADING)
-    predicted = np.empty(STATE_SIZE)
-    for i in range(3):
-        for j in range(3):
-            predicted[3 * i + j] = later[0][i, j]
-        predicted[9 + i], predicted[12 + i], predicted[15 + i] = (
-            later[1][i],
-            later[2][i],
-            later[3][i],
-        )
-        predicted[18 + i], predicted[21 + i] = later[4][i], later[5][i]
-    spread = transport @ covariance @ transport.T + _noise(seconds, deviations)
+    predicted = np.concatenate((
+        later[0].reshape(9), later[1], later[2], later[3], later[4], later[5],
+    ))  # fmt: skip
+    spread = transport @ covariance @ transport.T + _added(seconds, deviations)
     for i in range(6):
         for j in range(6):
             moved = predicted[12 + i] * predicted[12 + j]
@@ -263,9 +271,9 @@ def _predicted(
     return predicted, spread, transport
 
 
-@kernel
-def _noise(seconds: float, deviations: Array) -> Array:
-    """Return the covariance (18,18) that new accelerations add."""
+@entry
+def _added(seconds: float, deviations: Array1) -> Array:
+    """Return the covariance (18,18) that new accelerations (4,) add, in SI units."""
     unit = singer(abs(seconds))
     noise = np.zeros((PARAMETERS, PARAMETERS))
     for i in range(3):
@@ -276,98 +284,151 @@ def _noise(seconds: float, deviations: Array) -> Array:
     return noise
 
 
-@entry
-def _back(
-    state: Array1, covariance: Array2, predicted: Array1, prediction: Array2, known: Array2,
-    transport: Array2, smoothed: Array1, smoothed_covariance: Array2,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Smooth a filtered motion with the next sample's smoothed one.
+def acceleration_covariance(acceleration: Acceleration, dt: float, readout_time: float) -> Array:
+    """Return the covariance (18,18), per readout, that new accelerations add over ``dt`` s.
 
-    ``known``: (18,18) inverse of the prediction's covariance.
+    The deviations are those of the accelerations themselves, at any time (Singer's model in closed
+    form).
     """
-    gain = covariance @ transport.T @ known
-    back = apply_step(state, gain @ step_between(predicted, smoothed))
-    spread = covariance + gain @ (smoothed_covariance - prediction) @ gain.T
-    return back, 0.5 * (spread + spread.T)
+    units = _per_second(readout_time)
+    added: Array = _added(float(dt), _deviations(acceleration)) / np.outer(units, units)
+    return added
+
+
+def _deviations(acceleration: Acceleration) -> Array:
+    return np.repeat([float(acceleration.angular), float(acceleration.linear)], (3, 1))
+
+
+@kernel
+def singer(seconds: float) -> Array:
+    """Return the covariance (3,3) of way, velocity, acceleration per unit acceleration, SI."""
+    x = seconds / FADING
+    block = np.empty((3, 3))
+    if x < _SHORT:
+        # White noise on the acceleration, to first order.
+        block[0, 0], block[0, 1], block[0, 2] = x**5 / 10.0, x**4 / 4.0, x**3 / 3.0
+        block[1, 1], block[1, 2], block[2, 2] = 2.0 * x**3 / 3.0, x**2, 2.0 * x
+    else:
+        e, e2 = math.exp(-x), math.exp(-2.0 * x)
+        block[0, 0] = 1.0 - e2 + 2.0 * x + 2.0 * x**3 / 3.0 - 2.0 * x**2 - 4.0 * x * e
+        block[0, 1] = e2 + 1.0 - 2.0 * e + 2.0 * x * e - 2.0 * x + x**2
+        block[0, 2] = 1.0 - e2 - 2.0 * x * e
+        block[1, 1] = 4.0 * e - 3.0 - e2 + 2.0 * x
+        block[1, 2] = e2 + 1.0 - 2.0 * e
+        block[2, 2] = 1.0 - e2
+    units = (FADING * FADING, FADING, 1.0)
+    for i in range(3):
+        for j in range(i, 3):
+            block[i, j] *= units[i] * units[j]
+            block[j, i] = block[i, j]
+    return block
 
 
 @entry
 def _solve(
     times: Array1, states: Array2, informations: Array3, gradients: Array2, start: Array1,
     start_covariance: Array2, deviations: Array1, readout_share: float,
-) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array]:  # fmt: skip
+) -> tuple[Array, Array, Array, Array, Array, Array, Array]:  # fmt: skip
     """Filter and smoother: the fields of :class:`_Solved`; times (n,) in s after the start."""
     count = len(times)
-    square = (count, PARAMETERS, PARAMETERS)
-    predicted, filtered = np.empty((count, STATE_SIZE)), np.empty((count, STATE_SIZE))
+    square = (count + 1, PARAMETERS, PARAMETERS)
+    predicted, filtered = np.empty((count, STATE_SIZE)), np.empty((count + 1, STATE_SIZE))
     predictions, transports, covariances = np.empty(square), np.empty(square), np.empty(square)
     knowns = np.empty(square)  # inverses of the predictions
-    state, covariance, time = start, start_covariance, 0.0
+    filtered[0], covariances[0], time = start, start_covariance, 0.0
     for k in range(count):
         predicted[k], predictions[k], transports[k] = _predicted(
-            state, covariance, times[k] - time, deviations, readout_share
+            filtered[k], covariances[k], times[k] - time, deviations, readout_share
         )
         known = knowns[k]
         known[:] = inverted(predictions[k])
-        covariances[k] = inverted(informations[k] + known)
+        covariances[k + 1] = inverted(informations[k] + known)
         right = gradients[k] + known @ step_between(states[k], predicted[k])
-        filtered[k] = apply_step(states[k], covariances[k] @ right)
-        state, covariance, time = filtered[k], covariances[k], times[k]
+        filtered[k + 1] = apply_step(states[k], covariances[k + 1] @ right)
+        time = times[k]
     smoothed, smoothed_covariances = filtered.copy(), covariances.copy()
-    scores = np.zeros((4, 3))
-    weight, block, unit = 1.0, np.empty((3, 3)), np.empty((3, 3))
+    scores, weight, block = np.zeros((4, 3)), 1.0, np.empty((3, 3))
     for k in range(count - 1, -1, -1):
-        known = knowns[k]
-        pulled = known @ step_between(predicted[k], smoothed[k])
-        spread = known - known @ smoothed_covariances[k] @ known
-        unit[:] = singer(times[k] - (times[k - 1] if k > 0 else 0.0))
+        known, after = knowns[k], smoothed_covariances[k + 1]
+        step = step_between(predicted[k], smoothed[k + 1])
+        pulled, spread = known @ step, known - known @ after @ known
+        unit = singer(times[k] - (times[k - 1] if k > 0 else 0.0))
         for axis in range(6):
-            place, total, expected = min(axis, 3), 0.0, 0.0
+            place = min(axis, 3)
+            variance, total, expected = deviations[place] ** 2, 0.0, 0.0
             for i in range(3):
                 for j in range(3):
-                    added = deviations[place] ** 2 * unit[i, j]
-                    total += added * pulled[6 * i + axis] * pulled[6 * j + axis]
+                    total += variance * unit[i, j] * pulled[6 * i + axis] * pulled[6 * j + axis]
                     block[i, j] = 0.0
                     for m in range(3):
-                        shared = deviations[place] ** 2 * unit[i, m]
-                        block[i, j] += shared * spread[6 * m + axis, 6 * j + axis]
+                        shared = spread[6 * m + axis, 6 * j + axis]
+                        block[i, j] += variance * unit[i, m] * shared
                 expected += block[i, i]
             scores[place, 0] += weight * total
             scores[place, 1] += weight * expected
-            for i in range(3):
-                for j in range(3):
-                    scores[place, 2] += weight * block[i, j] * block[j, i]
+            scores[place, 2] += weight * np.sum(block * block.T)
         weight *= _FORGETTING
-        if k > 0:
-            smoothed[k - 1], smoothed_covariances[k - 1] = _back(
-                filtered[k - 1], covariances[k - 1], predicted[k], predictions[k], knowns[k],
-                transports[k], smoothed[k], smoothed_covariances[k],
-            )  # fmt: skip
+        gain = covariances[k] @ transports[k].T @ known
+        smoothed[k] = apply_step(filtered[k], gain @ step)
+        whole = covariances[k] + gain @ (after - predictions[k]) @ gain.T
+        smoothed_covariances[k] = 0.5 * (whole + whole.T)
     return (
-        predicted, predictions, transports, filtered, covariances, smoothed,
+        predicted[-1], predictions[count - 1], filtered, covariances, smoothed,
         smoothed_covariances, scores,
     )  # fmt: skip
 
 
-@entry
-def _told_by_points(covariance: Array2, known: Array2) -> Array:
+def _told_by_points(covariance: Array, known: Array) -> Array:
     """Return the information (18,18) of a posterior beyond its prior.
 
     By the eigenvalues of what was known, in units of the posterior: none of them exceeds 1.
     """
     whole = inverted(covariance)
-    scale = np.sqrt(np.diag(whole))
+    scale = np.sqrt(np.diagonal(whole))
     units = np.outer(scale, scale)
     factor = np.linalg.cholesky(whole / units)
     back = np.linalg.inv(factor)
     part = back @ (known / units) @ back.T
     values, vectors = np.linalg.eigh(0.5 * (part + part.T))
-    root = np.empty_like(whole)
-    for k in range(len(values)):
-        root[:, k] = vectors[:, k] * np.sqrt(max(1.0 - values[k], 0.0))
-    half = np.ascontiguousarray(factor) @ root
+    half = factor @ (vectors * np.sqrt(np.maximum(1.0 - values, 0.0)))
     told: Array = (half @ half.T) * units
     return told
+
+
+def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array, Array]:
+    """Return the motion without vibration, both covariances, and the derivative of that motion.
+
+    A camera that shakes is, in the middle row, somewhere on its swing; a frame later it is
+    somewhere else on it. What a gyroscope knows of the turn is not in the motion, either.
+    """
+    motion, shake, joint = estimate.without_gyro(), estimate.shake, estimate.joint_covariance
+    values, rates = MIDDLE_VALUES[: len(shake)], MIDDLE_RATES[: len(shake)]
+    turned = so3.exp(values @ shake)
+    still = Motion(
+        turned @ motion.rotation, turned @ motion.translation,
+        motion.angular_velocity - rates @ shake, motion.linear_velocity,
+        angular_acceleration=motion.angular_acceleration,
+        linear_acceleration=motion.linear_acceleration,
+    )  # fmt: skip
+    squares, swing = np.square(shake).sum(axis=1) / 3.0, np.zeros((PARAMETERS, PARAMETERS))
+    swing[TURN, TURN] = (values**2 @ squares) * np.eye(3)
+    swing[ANGULAR, ANGULAR] = (rates**2 @ squares) * np.eye(3)
+    jacobian = _UNSHAKEN[:, : len(joint)]
+    covariance = jacobian @ joint @ jacobian.T
+    # Pose and turn cancel: what rounding leaves of the difference of two large variances.
+    return still, 0.5 * (covariance + covariance.T), swing, jacobian
+
+
+def mean_turn(turn: GyroRotation) -> tuple[Array, Array]:
+    """Return the mean rate (3,) of a known turn and a covariance (18,18), to go on without it.
+
+    How much the rate changed within the readout, a gyroscope knows it to change in the next.
+    """
+    ends, rates = turn.at_rows(np.array([-0.5, 0.5]))
+    mean = so3.log(np.ascontiguousarray(ends[0] @ ends[1].T))
+    spread = np.zeros((PARAMETERS, PARAMETERS))
+    spread[ANGULAR, ANGULAR] = np.mean((rates - mean) ** 2) * np.eye(3)
+    return mean, spread
 
 
 def _per_second(span: float) -> Array:
@@ -377,7 +438,7 @@ def _per_second(span: float) -> Array:
 
 
 def _state(motion: Motion, units: Array) -> Array:
-    state: Array = state_in(motion, np.zeros(3))
+    state: Array = state_in(motion, _ORIGIN)
     state[12:] *= units[6:]
     return state
 
@@ -413,7 +474,7 @@ def told_of(estimate: Estimate, known: PriorTerms) -> MotionSample:
     """
     motion, covariance, _, _ = unshaken(estimate)
     information, slope = np.zeros((PARAMETERS,) * 2), np.zeros(PARAMETERS)
-    state = state_in(motion, np.zeros(3))
+    state = state_in(motion, _ORIGIN)
     add_prior(known, state, 1.0, information, slope)
     return MotionSample(estimate.time_ns, state, _told_by_points(covariance, information), slope)
 
@@ -447,9 +508,8 @@ def estimate_at(estimate: Estimate, gaussian: Gaussian) -> Estimate:
     known, spread = motion_of(gaussian, estimate.span)
     joint = estimate.joint_covariance
     gain = np.linalg.solve(covariance, jacobian @ joint).T
-    origin = np.zeros(3)
-    step = gain @ step_between(state_in(motion, origin), state_in(known, origin))
-    state = apply_step(state_in(estimate, origin), step[:PARAMETERS])
+    step = gain @ step_between(state_in(motion, _ORIGIN), state_in(known, _ORIGIN))
+    state = apply_step(state_in(estimate, _ORIGIN), step[:PARAMETERS])
     joint = joint + gain @ (spread - covariance) @ gain.T
     return estimate.with_joint_covariance(
         0.5 * (joint + joint.T),
@@ -490,35 +550,82 @@ def errors_ahead(window: MotionWindow, found: Estimate, swing: Array) -> Array:
         found: its estimate, with the time.
         swing: (18,18) covariance of the shaking about the predicted motion, per readout.
     """
-    newest = window.newest
-    ratios: Array = _errors_ahead(
-        newest.state, newest.covariance, 1e-9 * (found.time_ns - newest.time_ns),
-        window.deviations, window.readout_share, _per_second(found.span), swing,
-        state_in(found, np.zeros(3)), np.ascontiguousarray(found.joint_covariance),
-    )  # fmt: skip
-    return ratios
+    assert found.time_ns is not None
+    motion, covariance = motion_of(window.after(found.time_ns), found.span)
+    step = step_between(state_in(motion, _ORIGIN), state_in(found, _ORIGIN))
+    claimed = covariance + swing
+    second = found.joint_covariance[:PARAMETERS, :PARAMETERS] + np.outer(step, step)
+    parts = [slice(k, k + 3) for k in range(0, MOTION_PARAMETERS, 3)]
+    return np.array([
+        np.sum(inverted(claimed[part, part].copy()) * second[part, part]) / 3.0 for part in parts
+    ])  # fmt: skip
 
 
-@entry
-def _errors_ahead(
-    state: Array1, covariance: Array2, seconds: float, deviations: Array1, readout_share: float,
-    units: Array1, swing: Array2, found: Array1, joint: Array2,
-) -> Array:  # fmt: skip
-    later, spread, _ = _predicted(state, covariance, seconds, deviations, readout_share)
-    for k in range(6, PARAMETERS):
-        later[6 + k] /= units[k]
-    step, ratios, block = step_between(later, found), np.zeros(4), np.empty((3, 3))
-    for part in range(4):
-        first = 3 * part
-        for i in range(3):
-            for j in range(3):
-                row, column = first + i, first + j
-                claimed = spread[row, column] / (units[row] * units[column])
-                block[i, j] = claimed + swing[row, column]
-        known = inverted(block)
-        for i in range(3):
-            for j in range(3):
-                row, column = first + i, first + j
-                second = joint[row, column] + step[row] * step[column]
-                ratios[part] += known[i, j] * second / 3.0
-    return ratios
+class PredictionErrors:
+    """Factors of the variances of predictions ahead of the images, learnt from the last ones.
+
+    Each horizon has a factor for rotation, position, angular and linear velocity. Let ``e`` be the
+    step from prediction to estimate, ``P`` and ``C`` their covariances. The expected squared error,
+    given the image, over the claimed one is ``(e' P^-1 e + tr(P^-1 C)) / 3``.
+
+    Args:
+        longest: s ahead, at most.
+    """
+
+    def __init__(self, longest: float) -> None:
+        self._longest = longest
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all images so far."""
+        self._factors = np.ones((len(_KNOTS), 4))
+        self._told = np.zeros(len(_KNOTS))  # images that tell of each
+        self._least = _LEAST
+        # When each of the last images was, the motion until then, and the shaking about it.
+        self._past: list[tuple[int, MotionWindow, Array]] = []
+
+    def add(self, found: Estimate, window: MotionWindow, swing: Array) -> None:
+        """Compare what was predicted for an image, and predict from it.
+
+        Args:
+            found: its estimate.
+            window: of the motion, until then.
+            swing: (18,18) covariance of the shaking about that motion, per readout.
+        """
+        if self._longest <= 0.0:
+            return
+        self._least = _LEAST if found.turn is None else _LEAST_UNLEARNT
+        apart, kept = math.inf, []  # s since the newest of the past
+        for past in self._past:
+            seconds = 1e-9 * (found.time_ns - past[0])
+            if 0.0 < seconds <= 1.2 * self._longest:
+                apart = seconds
+                kept.append(past)
+                self._learn(apart, errors_ahead(past[1], found, past[2]))
+        if apart > 0.45 * _KNOTS[0] * self._longest:
+            kept.append((found.time_ns, window, swing))
+        self._past = kept
+
+    def _learn(self, seconds: float, ratios: Array) -> None:
+        if not np.isfinite(ratios).all():  # rounding errors are all that is left of a covariance
+            return
+        # Copies of this object keep theirs.
+        self._told, self._factors = self._told.copy(), self._factors.copy()
+        place = np.clip(seconds / self._longest, _KNOTS[0], _KNOTS[-1])
+        for k, weight in enumerate(np.maximum(1.0 - np.abs(place - _KNOTS) / _KNOTS[0], 0.0)):
+            if weight > 0.0:
+                self._told[k] += weight
+                newest = min(max(_NEWEST * weight, weight / (1.0 + self._told[k])), _FIRST)
+                self._factors[k] += newest * (np.minimum(ratios, _MOST_RATIO) - self._factors[k])
+
+    def widened(self, predicted: Estimate, seconds: float) -> Estimate:
+        """Widen the covariance of a prediction this many s ahead by the errors of earlier ones."""
+        told = self._told > 0.0
+        if not told.any():
+            return predicted
+        horizons = self._longest * _KNOTS[told]
+        factors = [np.interp(seconds, horizons, of) for of in self._factors[told].T]
+        scale = np.ones(PARAMETERS)
+        scale[:MOTION_PARAMETERS] = np.repeat(np.sqrt(_FEW * np.maximum(factors, self._least)), 3)
+        covariance = predicted.joint_covariance * np.outer(scale, scale)
+        return replace(predicted, joint_covariance=covariance)
