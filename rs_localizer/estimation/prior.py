@@ -21,25 +21,32 @@ from rs_localizer.config import LocalizerConfig, RefinementKind
 from rs_localizer.core.arrays import Array, Array1, Array2, Array3, Out
 from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.rig import Rig
-from rs_localizer.core.shutter import Motion, numbers_of
+from rs_localizer.core.shutter import Motion
 from rs_localizer.core.so3 import log
 from rs_localizer.core.state import (
     ACCELERATIONS,
     ANGULAR,
+    ANGULAR_ACCELERATION,
     LINEAR,
     MOTION_PARAMETERS,
+    MOVE,
     PARAMETERS,
+    POSE,
     STATE_ANGULAR,
     STATE_SIZE,
+    TURN,
 )
-from rs_localizer.native import entry, inlined, kernel
+from rs_localizer.native import entry, inlined
 from rs_localizer.solvers.table import Solver
 
 # Rounding error of an orthonormal matrix, or of a symmetric one with a unit diagonal.
 _ROUNDING = 1e-6
 # Least eigenvalue of a covariance scaled to a unit diagonal; smaller ones are rounding.
 _LEAST_EIGENVALUE = 1e-12
-_FAULTS = ("", "finite where its diagonal is", "symmetric", "positive definite")
+# Squares of larger numbers, and inverses of smaller variances, are infinite.
+_FARTHEST, _LEAST_VARIANCE = 1e150, 1e-100
+# Rates of a turn and their changes, in a step.
+_TURNING = np.ix_(*[np.r_[ANGULAR, ANGULAR_ACCELERATION]] * 2)
 
 
 def check_motion(motion: Motion) -> None:
@@ -48,37 +55,19 @@ def check_motion(motion: Motion) -> None:
     Raises:
         ValueError: wrong shapes, values that are not finite, a rotation that is none.
     """
-    names = [each.name for each in fields(Motion)]
-    for name in names:
-        shape = (3, 3) if name == "rotation" else (3,)
-        if np.shape(getattr(motion, name)) != shape:
+    for each in fields(Motion):
+        value, shape = getattr(motion, each.name), (3, 3) if each.name == "rotation" else (3,)
+        if np.shape(value) != shape:
             raise ValueError(
-                f"the prior motion's {name} must be of shape {shape}, "
-                f"got {np.shape(getattr(motion, name))}"
+                f"the prior motion's {each.name} must be of shape {shape}, got {np.shape(value)}"
             )
-    numbers = numbers_of(motion)
-    for name, part in zip(names, numbers, strict=True):
-        if not _is_finite(part.reshape(-1)):
-            raise ValueError(f"the prior motion's {name} is not finite: {getattr(motion, name)}")
-    if not _is_rotation(numbers[0]):
-        found = numbers[0].tolist()
+        if not np.all(np.abs(value) < _FARTHEST):  # NaN is not
+            raise ValueError(f"the prior motion's {each.name} is not finite: {value}")
+    rotation = np.asarray(motion.rotation, float)
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if not (off <= _ROUNDING and np.linalg.det(rotation) > 0.0):
+        found = rotation.tolist()
         raise ValueError(f"the prior motion's rotation is not orthonormal: {found}")
-
-
-@entry
-def _is_finite(numbers: Array1) -> bool:
-    """Return True if the squares of numbers (n,) have a finite sum."""
-    total = 0.0
-    for number in numbers:
-        total += number * number
-    return bool(np.isfinite(total))
-
-
-@entry
-def _is_rotation(matrix: Array2) -> bool:
-    """Return True if a matrix (3,3) is orthonormal, to rounding, and no mirror."""
-    off = np.abs(matrix @ matrix.T - np.eye(3)).max()
-    return bool(off <= _ROUNDING and np.linalg.det(matrix) > 0.0)
 
 
 def check_covariance(covariance: Array) -> None:
@@ -89,45 +78,18 @@ def check_covariance(covariance: Array) -> None:
     """
     if covariance.shape not in ((MOTION_PARAMETERS,) * 2, (PARAMETERS,) * 2):
         raise ValueError(f"covariance must be (12,12) or (18,18), got {covariance.shape}")
-    fault = _FAULTS[_fault_of(np.ascontiguousarray(covariance))]
-    if fault:
-        raise ValueError(f"covariance must be {fault}")
-
-
-@entry
-def _fault_of(covariance: Array2) -> int:
-    """Place in ``_FAULTS`` of what is wrong with a covariance (k,k); 0: nothing."""
-    known = np.flatnonzero(~np.isinf(np.diag(covariance)))
-    block = covariance[known][:, known].copy()
-    if not np.all(np.isfinite(block)):
-        return 1
-    scale = np.sqrt(np.abs(np.diag(block)))
-    for i in range(len(known)):
-        for j in range(i):
-            if not abs(block[i, j] - block[j, i]) <= _ROUNDING * scale[i] * scale[j]:
-                return 2
-    return 0 if _is_positive(block, scale) else 3
-
-
-@inlined
-def _is_positive(matrix: Array, scale: Array) -> bool:
-    """Return True if a matrix, scaled to a unit diagonal, is positive definite (Cholesky)."""
-    size = len(matrix)
-    factor = np.empty((size, size))
-    for i in range(size):
-        if not matrix[i, i] > 0.0:
-            return False
-        for j in range(i + 1):
-            total = matrix[i, j] / (scale[i] * scale[j])
-            for k in range(j):
-                total -= factor[i, k] * factor[j, k]
-            if i > j:
-                factor[i, j] = total / factor[j, j]
-            elif total > _LEAST_EIGENVALUE:
-                factor[i, i] = np.sqrt(total - _LEAST_EIGENVALUE)
-            else:
-                return False
-    return True
+    known = ~np.isinf(np.diagonal(covariance))
+    block = covariance[known][:, known]
+    if not np.isfinite(block).all():
+        raise ValueError("covariance must be finite where its diagonal is")
+    scale = np.sqrt(np.maximum(np.diagonal(block), _LEAST_VARIANCE))
+    unit = block / scale / scale[:, None]
+    if not np.all(np.abs(unit - unit.T) <= _ROUNDING):
+        raise ValueError("covariance must be symmetric")
+    try:
+        np.linalg.cholesky(unit - _LEAST_EIGENVALUE * np.eye(len(unit)))
+    except np.linalg.LinAlgError:
+        raise ValueError("covariance must be positive definite") from None
 
 
 # Least deviation of a measurement; with it a velocity is held at its mean whatever the points say.
@@ -243,7 +205,6 @@ def held_terms() -> PriorTerms:
     return _single(np.diag(precisions), _STILL)
 
 
-@entry
 def terms_at(terms: PriorTerms, speed: float, turn_known: bool) -> PriorTerms:
     """Return the prior of a typical speed, a part of the configured one; 0: at rest.
 
@@ -251,39 +212,17 @@ def terms_at(terms: PriorTerms, speed: float, turn_known: bool) -> PriorTerms:
     jolts come at any speed. At rest, only gravity is as in the terms. What a gyroscope leaves of a
     turn does not depend on the speed.
     """
-    informations, references = terms.informations.copy(), terms.references
+    informations = terms.informations.copy()
     if speed == 0.0:
-        informations = np.zeros((1, PARAMETERS, PARAMETERS))
-        references = references[:1].copy()
-        for i in range(6, PARAMETERS):
-            informations[0, i, i] = _LEAST_DEVIATION**-2
+        informations = held_terms().informations.copy()
     else:
         informations[0, ANGULAR] /= speed**2
         informations[0, LINEAR] /= max(speed, _WALKING) ** 2
         informations[0, ACCELERATIONS] /= min(_JOLTS * speed, 1.0) ** 2
     if turn_known:
-        for i in range(6):
-            for j in range(6):
-                row, column = _turning(i), _turning(j)
-                informations[0, row, column] = terms.informations[0, row, column]
-    return PriorTerms(informations, references, terms.gravity, terms.pivots[: len(references)])
-
-
-@entry
-def _with_turn(informations: Array3, error: Array2) -> Array:
-    """Return the prior of a motion beside a known rotation; error (6,6): ``GyroRotation.error``."""
-    changed, precision = informations.copy(), np.linalg.inv(error)
-    for i in range(6):
-        for j in range(6):
-            changed[0, _turning(i), _turning(j)] = precision[i, j]
-    return changed
-
-
-@kernel
-def _turning(i: int) -> int:
-    """Place in a step of the turn rate, and of its change six places behind it."""
-    place: int = 6 + i + i // 3 * 3
-    return place
+        informations[0][_TURNING] = terms.informations[0][_TURNING]
+    count = len(informations)
+    return PriorTerms(informations, terms.references[:count], terms.gravity, terms.pivots[:count])
 
 
 def _single(information: Array, reference: Array) -> PriorTerms:
@@ -327,63 +266,38 @@ def with_motion(
     """
     if prior.motion is None or not knows_motion(prior):
         return terms
-    covariance = np.ascontiguousarray(prior.covariance, np.float64)
-    return _with_motion(terms, covariance, state_in(prior.motion, centre), turn_known)
-
-
-@entry
-def _with_motion(
-    terms: PriorTerms, covariance: Array2, reference: Array1, turn_known: bool
-) -> PriorTerms:
-    informations, references, count = terms.informations, terms.references, len(terms.informations)
-    found = np.empty((count + 1, PARAMETERS, PARAMETERS))
-    of = np.empty((count + 1, STATE_SIZE))
-    found[:count], of[:count] = informations, references
-    found[count], of[count] = _inverse(covariance), reference
+    covariance = np.asarray(prior.covariance, np.float64)
+    informations = np.concatenate([terms.informations, _information(covariance)[None]])
     if len(covariance) == PARAMETERS:  # it knows the accelerations better than a default
-        found[0, ACCELERATIONS] = 0.0
+        informations[0, ACCELERATIONS] = 0.0
         if turn_known:
-            for i in range(6):
-                for j in range(6):
-                    found[0, _turning(i), _turning(j)] = 0.0
-    pivots = np.zeros((count + 1, 3))
-    pivots[:count], pivots[count] = terms.pivots, pivot_of(covariance)
-    return PriorTerms(found, of, terms.gravity, pivots)
+            informations[0][_TURNING] = 0.0
+    return PriorTerms(
+        informations, np.vstack([terms.references, state_in(prior.motion, centre)]), terms.gravity,
+        np.vstack([terms.pivots, pivot_of(covariance)]),
+    )  # fmt: skip
 
 
-@entry
-def pivot_of(covariance: Array2) -> Array:
+def pivot_of(covariance: Array) -> Array:
     """Return the point (3,), in camera axes, whose place in the view is known best.
 
     Who turns about it moves by its distance times the turn: that is the part of the move that goes
     with the turn. A camera that a measured position holds turns about itself.
     """
-    turned, along = np.zeros((3, 3)), np.zeros(3)
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        along[i] = covariance[j, 3 + k] - covariance[k, 3 + j]
-        for m in range(3):
-            turned[i, m] -= covariance[i, m]
-            turned[i, i] += (1.0 + _RIDGE) * covariance[m, m]
-    pivot = np.zeros(3)
-    if np.all(np.isfinite(covariance[:6, :6])):
-        pivot = np.linalg.inv(turned) @ along
-    return pivot if np.all(np.isfinite(pivot)) else np.zeros(3)
+    if not np.isfinite(covariance[POSE, POSE]).all():
+        return np.zeros(3)
+    turn, across = covariance[TURN, TURN], covariance[TURN, MOVE]
+    turned = (1.0 + _RIDGE) * np.trace(turn) * np.eye(3) - turn
+    crossed = across - across.T
+    pivot = np.linalg.solve(turned, np.array([crossed[1, 2], crossed[2, 0], crossed[0, 1]]))
+    return pivot if np.isfinite(pivot).all() else np.zeros(3)
 
 
-@inlined
-def _inverse(covariance: Array) -> Array:
+def _information(covariance: Array) -> Array:
     """Return the information (18,18) of a covariance, zero for infinite variances."""
-    places = np.flatnonzero(np.isfinite(np.diag(covariance)))
-    known = len(places)
-    block, information = np.empty((known, known)), np.zeros((PARAMETERS, PARAMETERS))
-    for i in range(known):
-        for j in range(known):
-            block[i, j] = covariance[places[i], places[j]]
-    inverse = np.linalg.inv(block)
-    for i in range(known):
-        for j in range(known):
-            information[places[i], places[j]] = inverse[i, j]
+    known = np.flatnonzero(np.isfinite(np.diagonal(covariance)))
+    information = np.zeros((PARAMETERS, PARAMETERS))
+    information[np.ix_(known, known)] = np.linalg.inv(covariance[np.ix_(known, known)])
     return information
 
 
@@ -611,7 +525,9 @@ def of_frame(
     """Add what is known of this frame by a gyroscope, of rest or of vibration."""
     if turn is not None:
         assumed = replace(assumed, turn=turn_seen(terms, turn))
-        terms = terms._replace(informations=_with_turn(terms.informations, turn.error))
+        informations = terms.informations.copy()
+        informations[0][_TURNING] = np.linalg.inv(turn.error)
+        terms = terms._replace(informations=informations)
     if prior is not None:
         assumed = replace(assumed, of_rest=prior.of_rest, of_vibration=prior.of_vibration)
         terms = with_measurements(terms, prior)
