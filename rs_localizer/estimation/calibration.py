@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.config import CalibrationErrors
-from rs_localizer.core.arrays import Array, Array1, Array2, Array3, BoolArray1
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.bearings import pinhole, radial_slopes
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import by_lens, coefficients_of, corner_of
@@ -34,7 +34,6 @@ from rs_localizer.estimation.prior import SPEEDS, PriorTerms, add_prior, terms_a
 from rs_localizer.estimation.refine import inverted
 from rs_localizer.estimation.residuals import linearized
 from rs_localizer.estimation.smooth_error import ORDINARY, smooth_columns
-from rs_localizer.native import entry
 
 # Of each camera: centre (2), focal length, distortion, fy over fx.
 _ERRORS = 5
@@ -110,9 +109,11 @@ def calibration_effect(
     """
     observations, chosen = observed.observations, posterior.inliers
     exposure = observed.sighted.exposure
-    by_motion, image, tau = _lines(
-        observations.packed, observations.tau, posterior.state, posterior.shake, chosen
+    tau = observations.tau
+    lines = linearized(
+        observations.packed, len(tau), posterior.state, shake_at(tau, posterior.shake)
     )
+    by_motion, image, tau = lines.by_motion[chosen], lines.image[chosen], tau[chosen]
     turn = observed.sighted.turn
     rays = image if turn is None else rays_of_lens(turn, tau, image)
     if len(exposure.sides) == 1:
@@ -136,12 +137,36 @@ def calibration_effect(
         columns = np.concatenate([columns, by_point @ moved], axis=2)
     bend = posterior.bend[chosen] if posterior.bend.shape[1] else np.zeros((len(rays), 0))
     parts = posterior.speeds if len(posterior.speeds) else _CONFIGURED
-    effect: CalibrationEffect = _effect(
-        by_motion, posterior.shared * smooth_columns(by_motion, image, bend), columns,
-        posterior.state, terms, parts, turn is not None, posterior.noise**2,
-        posterior.inflation, tracked,
-    )  # fmt: skip
-    return effect
+    smooth = posterior.shared * smooth_columns(by_motion, image, bend)
+    variance, fitted = posterior.noise**2, PARAMETERS + smooth.shape[2]
+    rows = np.concatenate([by_motion, smooth, columns], axis=2).reshape(2 * len(rays), -1)
+    every = rows.T @ rows
+    still, of_pose = math.inf, inverted(every[POSE, POSE].copy())
+    if np.isfinite(of_pose).all():
+        still = longest_axis(posterior.inflation * variance * of_pose)
+    products, crossed = every[:fitted, :fitted].copy(), every[:fitted, fitted:]
+    products[PARAMETERS:, PARAMETERS:] += variance * np.eye(fitted - PARAMETERS)
+    of_errors = crossed[:PARAMETERS]
+    if tracked:  # else the covariance has what the smooth error does
+        crossed = np.hstack([crossed, variance * np.eye(fitted)[:, PARAMETERS:]])
+    pull, taken = np.zeros((MOTION_PARAMETERS, crossed.shape[1])), np.zeros_like(of_errors)
+    for speed, part in zip(SPEEDS, parts.tolist(), strict=True):
+        if part < _NO_PART:
+            continue
+        prior, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+        add_prior(terms_at(terms, speed, turn is not None), posterior.state, variance, prior, slope)
+        information = products.copy()
+        information[:PARAMETERS, :PARAMETERS] += prior
+        inverse = inverted(information)
+        if not np.isfinite(inverse).all():
+            return NO_EFFECT._replace(still_deviation=still)
+        pull -= part * (inverse[:MOTION_PARAMETERS] @ crossed)
+        taken += part * (inverted(products[:PARAMETERS, :PARAMETERS] + prior) @ of_errors)
+    # What no motion takes up.
+    beside = products[:PARAMETERS, :PARAMETERS] @ taken - 2.0 * of_errors
+    left = np.trace(every[fitted:, fitted:]) + np.sum(taken * beside)
+    residual = math.sqrt(max(float(left), 0.0) / max(len(rows), 1))
+    return CalibrationEffect(pull @ pull.T, residual, still)
 
 
 def promised(posterior: Posterior) -> float:
@@ -157,70 +182,6 @@ def widened(effect: CalibrationEffect, posterior: Posterior) -> CalibrationEffec
     """
     ratio = posterior.model_error / (math.e * promised(posterior))
     return effect._replace(covariance=max(ratio, 1.0) ** 2 * effect.covariance)
-
-
-@entry
-def _lines(
-    data: Array2, tau: Array1, state: Array1, shake: Array2, chosen: BoolArray1
-) -> tuple[Array, Array, Array]:
-    """Return derivatives (m,2,18) of chosen points by the motion, rays (m,2), row times (m,)."""
-    lines = linearized(data, len(tau), state, shake_at(tau, shake))
-    return lines.by_motion[chosen], lines.image[chosen], tau[chosen]
-
-
-@entry
-def _effect(
-    by_motion: Array3, smooth: Array3, columns: Array3, state: Array1, terms: PriorTerms,
-    parts: Array1, turn_known: bool, variance: float, inflation: float, tracked: bool,
-) -> CalibrationEffect:  # fmt: skip
-    """Return how errors move motion and smooth error.
-
-    Args:
-        by_motion, smooth, columns: derivatives (n,2,18), (n,2,q) by the motion and the smooth
-            error, and by how much the errors move the points (n,2,k).
-        parts: (s,) of the typical speeds.
-        variance, inflation: of the noise, px^2, and because it is an estimate.
-    """
-    count, q, errors = 2 * len(by_motion), smooth.shape[2], columns.shape[2]
-    size, rows = PARAMETERS + q, np.empty((count, PARAMETERS + q + errors))
-    rows[:, :PARAMETERS] = by_motion.reshape(count, PARAMETERS)
-    rows[:, PARAMETERS:size] = smooth.reshape(count, q)
-    rows[:, size:] = columns.reshape(count, errors)
-    every = rows.T @ rows
-    still, of_pose = np.inf, inflation * variance * inverted(every[POSE, POSE].copy())
-    if np.all(np.isfinite(of_pose)):
-        still = longest_axis(of_pose)
-    products = every[:size, :size].copy()
-    crossed = np.zeros((size, errors + q))
-    crossed[:, :errors] = every[:size, size:]
-    if tracked:  # else the covariance has what the smooth error does
-        for k in range(q):
-            crossed[PARAMETERS + k, errors + k] = variance
-    pull, taken = np.zeros((MOTION_PARAMETERS, errors + q)), np.zeros((PARAMETERS, errors))
-    of_errors = crossed[:PARAMETERS, :errors].copy()
-    for k in range(len(parts)):
-        if parts[k] < _NO_PART:
-            continue
-        of_motion, slope = products[:PARAMETERS, :PARAMETERS].copy(), np.zeros(PARAMETERS)
-        add_prior(terms_at(terms, SPEEDS[k], turn_known), state, variance, of_motion, slope)
-        information = products.copy()
-        for i in range(PARAMETERS):
-            for j in range(PARAMETERS):
-                information[i, j] = of_motion[i, j]
-        for i in range(PARAMETERS, len(products)):
-            information[i, i] += variance
-        inverse = inverted(information)
-        if not np.all(np.isfinite(inverse)):
-            nothing = np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS))
-            return CalibrationEffect(nothing, 0.0, still)
-        pull -= parts[k] * (inverse[:MOTION_PARAMETERS] @ crossed)
-        taken += parts[k] * (inverted(of_motion) @ of_errors)
-    # What no motion takes up.
-    left = np.trace(every[size:, size:].copy())
-    beside = products[:PARAMETERS, :PARAMETERS].copy() @ taken - 2.0 * of_errors
-    left += np.sum(taken * beside)
-    residual = np.sqrt(max(left, 0.0) / max(count, 1))
-    return CalibrationEffect(pull @ pull.T, residual, still)
 
 
 def _columns(camera: Camera, towards: Array, deviation: CalibrationErrors) -> Array:
