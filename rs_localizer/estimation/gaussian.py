@@ -23,10 +23,14 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, Array1, Array2, Array3
-from rs_localizer.core.state import PARAMETERS, STATE_TRANSLATION
+from rs_localizer.core.so3 import hat
+from rs_localizer.core.state import MOVE, PARAMETERS, STATE_TRANSLATION, TURN
 from rs_localizer.estimation.prior import offset_between
 from rs_localizer.estimation.refine import apply_step
-from rs_localizer.native import entry, kernel
+from rs_localizer.native import entry
+
+# -(a x b)_i is a^T of the i-th of these b.
+_CROSSES = hat(np.eye(3))
 
 
 class Gaussians(NamedTuple):
@@ -113,7 +117,7 @@ def mixture(parts: Gaussians, preferences: Array, temper: float) -> Mixture:
     mean = probable @ steps
     state = apply_step(first, mean)
     # About the pivot, which the move of a step is not.
-    state[STATE_TRANSLATION] = pivot - mean[3:6] + _cross(pivot, mean[:3])
+    state[STATE_TRANSLATION] = pivot - mean[MOVE] + hat(pivot) @ mean[TURN]
     pivot = state[STATE_TRANSLATION].copy()
     offsets, by_turns = _offsets_between(state, parts.states, pivot)
     # Covariances of steps as those of offsets, which go with the turn.
@@ -138,16 +142,8 @@ def _offsets_between(reference: Array1, states: Array2, pivot: Array1) -> tuple[
     return offsets, by_turns
 
 
-def _cross(a: Array, b: Array) -> Array:
-    """Return ``np.cross`` of vectors (3,), in a tenth of the time."""
-    return np.array([
-        a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0],
-    ])  # fmt: skip
-
-
-@entry
 def along_arcs(
-    covariance: Array2, centre: Array1, weights: Array1, offsets: Array2, covariances: Array3
+    covariance: Array, centre: Array, weights: Array, offsets: Array, covariances: Array
 ) -> Array:
     """Return the covariance to second order in the move; the rotation has no second order.
 
@@ -166,50 +162,24 @@ def along_arcs(
         covariances: (k,18,18) of the offsets.
     """
     # y = (phi, d): d = -rho + [p]x phi.
-    by_step, forms = np.eye(6), np.zeros((3, 6, 6))
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        by_step[3 + i, 3 + i] = -1.0
-        by_step[3 + j, i], by_step[3 + k, i] = centre[k], -centre[j]
-        # (phi x (phi x p))_i = phi_i (phi . p) - p_i (phi . phi)
-        for m in range(3):
-            forms[i, i, m] -= 0.25 * centre[m]
-            forms[i, m, i] -= 0.25 * centre[m]
-            forms[i, m, m] += 0.5 * centre[i]
-        forms[i, j, 3 + k] = forms[i, 3 + k, j] = -0.5
-        forms[i, k, 3 + j] = forms[i, 3 + j, k] = 0.5
-    farther, means = covariance.copy(), np.empty(3)
-    products, pulls = np.empty((3, 6, 6)), np.empty((3, 6))
-    for part in range(len(weights)):
-        spread = covariances[part, :, :6].copy()
-        mean = _times(offsets[part : part + 1, :6].copy(), by_step)
-        crossed = _times(spread, by_step)
-        both = _times(_times(by_step, spread[:6]), by_step)
-        for i in range(3):
-            products[i] = _times(forms[i], both)
-            pulls[i] = _times(mean, forms[i])[0]
-            means[i] = np.trace(products[i]) + np.sum(mean[0] * pulls[i])
-        pulled = _times(pulls, both)
-        across = 2.0 * _times(pulls, crossed)
-        for i in range(3):
-            for j in range(3):
-                second = means[i] * means[j] + 2.0 * np.sum(products[i] * products[j].T)
-                second += 4.0 * np.sum(pulls[j] * pulled[i])
-                farther[3 + i, 3 + j] += weights[part] * second
-            first = weights[part] * (means[i] * offsets[part] + across[i])
-            farther[3 + i] += first
-            farther[:, 3 + i] += first
+    by_step, forms, unit = np.eye(6), np.zeros((3, 6, 6)), np.eye(3)
+    by_step[MOVE, MOVE], by_step[MOVE, TURN] = -unit, hat(centre)
+    # -(phi x (phi x p))_i / 2 = (p_i (phi . phi) - phi_i (phi . p)) / 2
+    each = unit[:, :, None] * centre
+    forms[:, TURN, TURN] = 0.5 * centre[:, None, None] * unit
+    forms[:, TURN, TURN] -= 0.25 * (each + each.transpose(0, 2, 1))
+    # -(phi x d)_i
+    forms[:, TURN, MOVE] = 0.5 * _CROSSES
+    forms[:, MOVE, TURN] = forms[:, TURN, MOVE].transpose(0, 2, 1)
+    means, crossed = offsets[:, :6] @ by_step.T, covariances[:, :, :6] @ by_step.T
+    both = by_step @ crossed[:, :6]
+    products, pulls = forms @ both[:, None], (forms @ means[:, None, :, None])[..., 0]
+    size = np.trace(products, axis1=2, axis2=3) + (pulls @ means[:, :, None])[..., 0]
+    second = size[:, :, None] * size[:, None] + 4.0 * pulls @ both @ pulls.transpose(0, 2, 1)
+    second += 2.0 * np.einsum("kiab,kjba->kij", products, products)
+    first = size[:, :, None] * offsets[:, None] + 2.0 * pulls @ crossed.transpose(0, 2, 1)
+    farther, along = covariance.copy(), np.tensordot(weights, first, 1)
+    farther[MOVE, MOVE] += np.tensordot(weights, second, 1)
+    farther[MOVE] += along
+    farther[:, MOVE] += along.T
     return farther
-
-
-@kernel
-def _times(left: Array2, right: Array2) -> Array:
-    """Return the product ``left right^T`` of matrices so small that a loop is the fastest."""
-    product = np.empty((len(left), len(right)))
-    for i in range(len(left)):
-        for j in range(len(right)):
-            total = 0.0
-            for k in range(left.shape[1]):
-                total += left[i, k] * right[j, k]
-            product[i, j] = total
-    return product
