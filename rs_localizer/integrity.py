@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
 from rs_localizer.core.state import TURN
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.prior import Prior
-from rs_localizer.estimation.residuals import likeness
+from rs_localizer.native import entry
 
 NAMES = (
     "share", "together", "apart", "persists", "spread", "filled", "count", "innovation", "lasting",
@@ -225,3 +225,25 @@ def _transitions(innovation: float) -> Array:
         [goes, 1.0 - RECOVERS, goes],
         [stays * jump, 0.0, stays * (1.0 - jump)],
     ])  # fmt: skip
+
+
+@entry
+def likeness(points: Array2, numbers: Array1, neighbours: int) -> float:
+    """Return the mean product of numbers (n,) of points (n,3) and of their neighbours."""
+    count, total = len(points), 0.0
+    far, near = np.empty(neighbours), np.empty(neighbours)
+    for i in range(count):
+        far[:] = np.inf
+        for j in range(count):
+            square = 0.0
+            for axis in range(3):
+                square += (points[i, axis] - points[j, axis]) ** 2
+            if j == i or not square < far[neighbours - 1]:
+                continue
+            place = neighbours - 1
+            while place > 0 and square < far[place - 1]:
+                far[place], near[place] = far[place - 1], near[place - 1]
+                place -= 1
+            far[place], near[place] = square, numbers[j]
+        total += numbers[i] * near.sum()
+    return total / (count * neighbours)

@@ -22,16 +22,23 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Rig, RigEstimate
 from rs_localizer.core.state import POSE
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation.acceptance import noise_fills, refusal, speeding, uncertain
+from rs_localizer.estimation.acceptance import (
+    estimate_of,
+    noise_fills,
+    refusal,
+    sample_estimate,
+    speeding,
+    uncertain,
+)
 from rs_localizer.estimation.calibration import (
     NO_EFFECT,
     ErrorModes,
     calibration_effect,
     widened,
 )
-from rs_localizer.estimation.hypotheses import frame_posterior
+from rs_localizer.estimation.hypotheses import Posterior, frame_posterior
 from rs_localizer.estimation.left_out import LeftOut, left_out
-from rs_localizer.estimation.observations import (
+from rs_localizer.estimation.points import (
     NEAREST,
     Observed,
     Sighted,
@@ -42,7 +49,6 @@ from rs_localizer.estimation.observations import (
     relinearized,
     unfit,
 )
-from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, Posterior, best_motion
 from rs_localizer.estimation.prior import (
     Prior,
     PriorTerms,
@@ -51,9 +57,8 @@ from rs_localizer.estimation.prior import (
     state_in,
     with_motion,
 )
-from rs_localizer.estimation.ransac import Candidate, generator
-from rs_localizer.estimation.result import estimate_of, sample_estimate
-from rs_localizer.estimation.searching import MotionSearch
+from rs_localizer.estimation.robust import GATE, WIDEST_GATE, best_motion
+from rs_localizer.estimation.search import Candidate, MotionSearch, generator
 from rs_localizer.solvers.table import find_solver, start_solver
 
 # A prediction may be wrong by this multiple of the inlier threshold.

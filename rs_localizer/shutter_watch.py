@@ -33,9 +33,9 @@ from rs_localizer.core.scanning import ACROSS, REVERSED, ScanDirection
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import MOTION_PARAMETERS, POSE, VELOCITIES
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation.observations import find_usable, packed
+from rs_localizer.estimation.points import find_usable, packed
 from rs_localizer.estimation.prior import state_in
-from rs_localizer.estimation.residuals import linearized
+from rs_localizer.estimation.projection import linearized
 
 # If the readout time is off by more than this share, single frames are better than tracked ones.
 # The errors of a hand's angular velocity, tracked over single, are 0.95, 1.3 and 1.5 if it is off

@@ -32,7 +32,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "estimation": {"core", "config", "native", "solvers"},
     "inertial": {"core", "estimation", "native"},
     "localizer": {"core", "config", "solvers", "estimation"},
-    "integrity": {"core", "estimation"},
+    "integrity": {"core", "estimation", "native"},
     "repeated_images": {"core", "estimation"},
     "lens_watch": {"core"},
     "shutter_watch": {"core", "estimation"},

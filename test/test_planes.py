@@ -13,10 +13,10 @@ from benchmarks.frames.conditions import named
 from benchmarks.frames.judged import far_off, judge
 from rs_localizer.core.rig import Mounts, Rig
 from rs_localizer.core.shutter import project_rolling
-from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.posterior import Posterior, best_motion
+from rs_localizer.estimation.hypotheses import Posterior
+from rs_localizer.estimation.points import Observations
 from rs_localizer.estimation.prior import assumptions, state_in
-from rs_localizer.estimation.refine import apply_step
+from rs_localizer.estimation.robust import apply_step, best_motion
 from rs_localizer.solvers.table import find_solver
 
 CAMERA = rsl.Camera(1000, 1000, np.array([[1207, 0, 499.5], [0, 1207, 499.5], [0, 0, 1.0]]))

@@ -15,7 +15,7 @@ from rs_localizer.core import shutter
 from rs_localizer.core.shutter import carried, numbers_of
 from rs_localizer.core.state import step_between
 from rs_localizer.estimation.prior import state_in
-from rs_localizer.estimation.refine import apply_step
+from rs_localizer.estimation.robust import apply_step
 from rs_localizer.estimation.window import acceleration_covariance
 
 READOUT = 0.03

@@ -15,10 +15,10 @@ from benchmarks.independent.scenes import Rich
 from rs_localizer import data
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.rig import Mounts
-from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.points import Observations
 from rs_localizer.estimation.prior import PriorTerms, state_in
-from rs_localizer.estimation.refine import refine
-from rs_localizer.estimation.residuals import linearized
+from rs_localizer.estimation.projection import linearized
+from rs_localizer.estimation.robust import refine
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
@@ -54,7 +54,7 @@ def residual(camera: Camera, cloud, start: rsl.Motion, velocities) -> tuple[rsl.
     state = state_in(start, centre)
     state[12:] = held[12:]
     state = refine(
-        observations.packed, state, 1e6, 0.0,
+        observations.packed, state, (1e6, 0.0),
         PriorTerms(precision[None], held[None], np.zeros(7), np.zeros((1, 3))), 0.1, 2, 50, 1e-6,
     )[0]  # fmt: skip
     rotation = state[:9].reshape(3, 3)

@@ -20,11 +20,10 @@ from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.rig import Mounts, Rig
 from rs_localizer.core.state import STATE_SIZE
-from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.points import Observations
 from rs_localizer.estimation.prior import assumptions
-from rs_localizer.estimation.ransac import optimize
-from rs_localizer.estimation.refine import EXPECTED_NOISE, refine
-from rs_localizer.estimation.searching import SCORE_SCALE
+from rs_localizer.estimation.robust import EXPECTED_NOISE, refine
+from rs_localizer.estimation.search import SCORE_SCALE, optimize
 from rs_localizer.solvers.minimal import solve_minimal
 from rs_localizer.solvers.table import find_solver
 
@@ -172,7 +171,7 @@ def _refined(models: Array, trials: Trials, threshold: float) -> Motions:
         )
         if np.isfinite(cost):
             near = frame.only(np.flatnonzero(frame.squared_errors(state) < 4.0 * threshold**2))
-            found[i] = refine(near.packed, state, 1e6, 0.0, prior, noise, 2, 10, 1e-6)[0]
+            found[i] = refine(near.packed, state, (1e6, 0.0), prior, noise, 2, 10, 1e-6)[0]
     return _of_states(found)
 
 

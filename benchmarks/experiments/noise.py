@@ -17,7 +17,7 @@ from benchmarks.experiments.sweeps import ORIENTATION, Curves, motion_errors, sw
 from benchmarks.experiments.trials import POINTS, Setting, Trials, draw_trials
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
-from rs_localizer.estimation.residuals import normal_equations
+from rs_localizer.estimation.projection import normal_equations
 
 _NOISES = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
 _SPEED, _TRANSLATION = 20.0, 0.2  # deg and units per frame

@@ -212,7 +212,7 @@ def gyro_compensated(
     Row by row the bearings are turned back into the axes of the middle row, so that all that
     follows sees a camera that hardly turns. A point's row is measured with its pixel, and with it
     the turn: of the pixels' noise ``n`` the model explains ``m g^T n``, where ``g`` is the gradient
-    of the row time and ``m`` the velocity of the image point (:mod:`.estimation.residuals`). The
+    of the row time and ``m`` the velocity of the image point (:mod:`.estimation.projection`). The
     part ``k`` of ``m`` that is the known turn's is taken care of here, because
 
         I - (k + m) g^T = (I - k g^T) (I - m' g^T),   m' = (I - k g^T)^-1 m

@@ -5,7 +5,7 @@
 A state holds rotation (9, row-major) and translation (3), camera_from_map at the middle row. Then
 follow the angular and linear velocities (3, 3) and the accelerations (3, 3) there, per readout and
 per readout squared (:class:`rs_localizer.core.shutter.Motion`). A step has three parameters for the
-rotation; :func:`rs_localizer.estimation.refine.apply_step` applies it.
+rotation; :func:`rs_localizer.estimation.robust.apply_step` applies it.
 """
 
 from __future__ import annotations

@@ -26,13 +26,12 @@ from rs_localizer.core.bearings import pinhole, radial_slopes
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import by_lens, coefficients_of, corner_of
 from rs_localizer.core.shake import shake_at
-from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE, rotation_of
-from rs_localizer.estimation.observations import Observed, rays_of_lens
-from rs_localizer.estimation.plane import longest_axis
-from rs_localizer.estimation.posterior import Posterior
+from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE, TURN, rotation_of
+from rs_localizer.estimation.hypotheses import Posterior
+from rs_localizer.estimation.points import Observed, rays_of_lens
 from rs_localizer.estimation.prior import SPEEDS, PriorTerms, add_prior, terms_at
-from rs_localizer.estimation.refine import inverted
-from rs_localizer.estimation.residuals import linearized
+from rs_localizer.estimation.projection import linearized
+from rs_localizer.estimation.robust import inverted
 from rs_localizer.estimation.smooth_error import ORDINARY, smooth_columns
 
 # Of each camera: centre (2), focal length, distortion, fy over fx.
@@ -204,3 +203,8 @@ def _columns(camera: Camera, towards: Array, deviation: CalibrationErrors) -> Ar
     by_each = np.diagonal(by_all[:, :, focal : focal + 2], axis1=1, axis2=2)
     columns[:, :, 4] = deviation.aspect_ratio * by_each * _ASPECT
     return columns
+
+
+def longest_axis(covariance: Array) -> float:
+    """Return the deviation (rad) of the rotation about the axis that is known worst."""
+    return math.sqrt(np.linalg.eigvalsh(covariance[TURN, TURN])[-1])

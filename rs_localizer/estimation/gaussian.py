@@ -5,7 +5,7 @@
 The points say precisely in which direction they are and roughly how far away. A camera whose
 orientation they hardly tell is somewhere on an arc about them, and arcs leave their tangents: by
 half of 3 m times the square of 4 degrees, 7 mm, where the ellipsoid is thinner than 1 mm. In the
-terms of a step (turn ``phi``, move ``rho``; see :mod:`rs_localizer.estimation.refine`), points at
+terms of a step (turn ``phi``, move ``rho``; see :mod:`rs_localizer.estimation.robust`), points at
 ``p`` in camera axes that move there by ``d`` are seen from
 
     rho = p - exp([phi]x) (p + d)
@@ -26,7 +26,7 @@ from rs_localizer.core.arrays import Array, Array1, Array2, Array3
 from rs_localizer.core.so3 import hat
 from rs_localizer.core.state import MOVE, PARAMETERS, STATE_TRANSLATION, TURN
 from rs_localizer.estimation.prior import offset_between
-from rs_localizer.estimation.refine import apply_step
+from rs_localizer.estimation.robust import apply_step
 from rs_localizer.native import entry
 
 # -(a x b)_i is a^T of the i-th of these b.

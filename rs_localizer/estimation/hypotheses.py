@@ -42,12 +42,18 @@ from rs_localizer.estimation.linear_fit import (
     under,
     without,
 )
-from rs_localizer.estimation.observations import MOST_POINTS, NEAREST, Observations
-from rs_localizer.estimation.plane import plane_of
-from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, Posterior, best_motion
+from rs_localizer.estimation.points import MOST_POINTS, NEAREST, Observations, plane_of
 from rs_localizer.estimation.prior import SPEEDS, Assumed, PriorTerms, terms_at
-from rs_localizer.estimation.refine import LEAST_NOISE, TINY, apply_step, solve_positive
-from rs_localizer.estimation.residuals import Lines, linearized
+from rs_localizer.estimation.projection import Lines, linearized
+from rs_localizer.estimation.robust import (
+    GATE,
+    LEAST_NOISE,
+    TINY,
+    WIDEST_GATE,
+    apply_step,
+    best_motion,
+    solve_positive,
+)
 from rs_localizer.estimation.smooth_error import (
     ORDINARY,
     Shared,
@@ -100,8 +106,55 @@ _SHORT = 1e-2
 _STEPS = 20
 # Pose and velocities with the vibration by all unknowns, see MIDDLE.
 _TURNED = np.hstack([np.eye(PARAMETERS), MIDDLE])[:MOTION_PARAMETERS]
+# Least eigenvalue of an information matrix scaled to a unit diagonal.
+_LEAST_EIGENVALUE = 1e-11
 # Fewer inliers determine nothing; nor, beside an in-frame turn, do these.
 _FEWEST, _FEWEST_TURNING = 6, 8
+
+
+class Posterior(NamedTuple):
+    """The refined motion of one frame and what the points say of it."""
+
+    state: Array  # (24,)
+    covariance: Array  # (18,18), or more with the coefficients of the shaking
+    noise: float  # px, measured standard deviation
+    freedom: float  # of the errors
+    smallest_eigenvalue: float  # of the information scaled to a unit diagonal, or less
+    inliers: BoolArray  # (n,)
+    squared_errors: Array  # (n,) px^2
+    shake: Array = np.zeros((0, 3))  # (k,3) rad, coefficients
+    model_error: float = 0.0  # px, root mean square of what the motion leaves beside the noise
+    shared: float = 0.0  # px, likewise, of all modes together
+    declared: float = 0.0  # px, the part of it that the map is known to be off
+    speeding: float = 0.0  # squared velocities, in deviations of what the configuration expects
+    # Probabilities of the typical speeds; empty: the configured one
+    speeds: Array = np.zeros(0)
+    near_outliers: int = 0  # points just beyond the gate, where they are too many to be chance
+    # (18,18) with the second order of arcs, of a mixture; None: of the covariance as a Gaussian's
+    arched: Array | None = None
+    # (12,12) of pose and velocities, beside the covariance: vibration that hides in the noise
+    undetected: Array = np.zeros((12, 12))
+    # (s,f) logarithms of the evidence of each vibration, against none; empty: not looked at
+    vibrations: Array = np.zeros((0, 0))
+    # (n,b): of what the smooth error is a combination (see frame_fit), which other frames share, so
+    # that the covariance does not have it, either
+    bend: Array = np.zeros((0, 0))
+    gate: float = 0.0  # px, of inliers, which goes on to twice as many for their noise
+
+    @property
+    def determined(self) -> bool:
+        """True if points and prior together determine all parameters."""
+        return self.smallest_eigenvalue > _LEAST_EIGENVALUE
+
+    @property
+    def inflation(self) -> float:
+        """Inflation of the variances, because the noise itself is an estimate.
+
+        Squared distances follow an F distribution; this makes its 95 % quantile that of the
+        chi-squared one, to half a percent from 40 degrees of freedom.
+        """
+        left = max(self.freedom, 6.0)
+        return left / (left - 5.0)
 
 
 class MotionHypothesis(NamedTuple):

@@ -27,10 +27,10 @@ from rs_localizer.estimation.linear_fit import (
     linear_of,
     taken_by,
 )
-from rs_localizer.estimation.plane import leaning_less, plane_of
+from rs_localizer.estimation.points import leaning_less, plane_of
 from rs_localizer.estimation.prior import PriorTerms
-from rs_localizer.estimation.refine import TINY, apply_step
-from rs_localizer.estimation.residuals import linearized
+from rs_localizer.estimation.projection import linearized
+from rs_localizer.estimation.robust import TINY, apply_step
 from rs_localizer.estimation.smooth_error import Shared
 from rs_localizer.native import entry, inlined, kernel
 

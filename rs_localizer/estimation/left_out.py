@@ -16,20 +16,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, Array2, BoolArray
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.lens import centre_of, off_centre
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.state import MOVE, PARAMETERS, TURN, step_between
 from rs_localizer.core.types import Failure
 from rs_localizer.estimation.acceptance import speeding
 from rs_localizer.estimation.calibration import promised
-from rs_localizer.estimation.observations import Observations, Observed
-from rs_localizer.estimation.posterior import WIDEST_GATE, Posterior, best_motion
+from rs_localizer.estimation.hypotheses import Posterior
+from rs_localizer.estimation.points import Observations, Observed
 from rs_localizer.estimation.prior import add_prior
-from rs_localizer.estimation.refine import EXPECTED_NOISE, LEAST_NOISE, apply_step, solve_positive
-from rs_localizer.estimation.residuals import linearized
-from rs_localizer.estimation.searching import GLOBAL_SHUTTER_SCALE, MotionSearch
-from rs_localizer.native import entry
+from rs_localizer.estimation.projection import linearized
+from rs_localizer.estimation.robust import (
+    EXPECTED_NOISE,
+    LEAST_NOISE,
+    WIDEST_GATE,
+    apply_step,
+    best_motion,
+    solve_positive,
+)
+from rs_localizer.estimation.search import GLOBAL_SHUTTER_SCALE, MotionSearch
 
 # Six points have a motion whatever they are; the corners of one marker may be misplaced in the map.
 _SAMPLE, _MARKER = 6, 4
@@ -384,24 +390,14 @@ def _moved_alike(observed: Observed, posterior: Posterior, rest: BoolArray) -> f
     some = np.flatnonzero(rest & np.isfinite(lines.errors[:, 0]))
     some = some[:: len(some) // _MANY + 1]
     focal = observed.assumed.focal_length
-    places, rough = focal * observed.observations.rays[some], GLOBAL_SHUTTER_SCALE * focal
-    return as_nearest(places, lines.errors[some], rough) / max(len(some), 1)
-
-
-@entry
-def as_nearest(places: Array2, errors: Array2, rough: float) -> int:
-    """Count errors (n,2) of places (n,2) that roughly equal the one of the nearest place."""
-    count, alike = len(places), 0
-    for i in range(count):
-        nearest, apart = 0, np.inf
-        for j in range(count):
-            distance = math.hypot(places[i, 0] - places[j, 0], places[i, 1] - places[j, 1])
-            if j != i and distance < apart:
-                nearest, apart = j, distance
-        off = math.hypot(errors[i, 0] - errors[nearest, 0], errors[i, 1] - errors[nearest, 1])
-        if off < rough + _STRETCH * apart:
-            alike += 1
-    return alike
+    if len(some) < 2:
+        return 0.0
+    places, errors = focal * observed.observations.rays[some], lines.errors[some]
+    apart = np.linalg.norm(places[:, None] - places, axis=2)
+    np.fill_diagonal(apart, math.inf)
+    off = np.linalg.norm(errors - errors[apart.argmin(axis=1)], axis=1)
+    alike = off < GLOBAL_SHUTTER_SCALE * focal + _STRETCH * apart.min(axis=1)
+    return float(np.mean(alike))
 
 
 def _surprise(total: int, size: int, sample: int, chance: float) -> float:

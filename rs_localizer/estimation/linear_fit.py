@@ -52,8 +52,8 @@ from rs_localizer.core.shake import (
 from rs_localizer.core.state import ANGULAR, PARAMETERS, TURN
 from rs_localizer.estimation.gaussian import moments
 from rs_localizer.estimation.prior import PriorTerms, add_prior
-from rs_localizer.estimation.refine import LEAST_NOISE, TINY, half_inverse, squared
-from rs_localizer.estimation.residuals import Lines
+from rs_localizer.estimation.projection import Lines
+from rs_localizer.estimation.robust import LEAST_NOISE, TINY, half_inverse, squared
 from rs_localizer.estimation.smooth_error import ORDINARY, Shared
 from rs_localizer.native import entry, kernel
 

@@ -16,7 +16,7 @@ from numpy.polynomial.legendre import legvander
 
 from rs_localizer.core.arrays import Array, Array1, Array2, Array3, BoolArray, BoolArray1
 from rs_localizer.core.state import MOVE, TURN
-from rs_localizer.estimation.residuals import Lines
+from rs_localizer.estimation.projection import Lines
 from rs_localizer.native import entry, kernel
 
 DEGREE = 3

@@ -52,7 +52,7 @@ from rs_localizer.core.state import (
 )
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.prior import PriorTerms, add_prior, state_in
-from rs_localizer.estimation.refine import apply_step, inverted
+from rs_localizer.estimation.robust import apply_step, inverted
 from rs_localizer.native import entry, kernel
 
 LENGTH = 6

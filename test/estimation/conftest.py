@@ -11,7 +11,7 @@ from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.rig import Mounts
 from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.points import Observations
 from rs_localizer.estimation.prior import state_in
 
 K = np.array([[600.0, 0.0, 319.5], [0.0, 600.0, 239.5], [0.0, 0.0, 1.0]])

@@ -9,9 +9,10 @@ from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.rig import Mounts, Rig
 from rs_localizer.core.state import step_between
-from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.posterior import Posterior, best_motion
+from rs_localizer.estimation.hypotheses import Posterior
+from rs_localizer.estimation.points import Observations
 from rs_localizer.estimation.prior import assumptions
+from rs_localizer.estimation.robust import best_motion
 from rs_localizer.solvers.table import find_solver
 
 from .projection import gradient, in_camera, jacobian_of, pixels_of, row_time

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from rs_localizer.core.rig import Mounts
-from rs_localizer.estimation import observations, residuals
+from rs_localizer.estimation import projection
+from rs_localizer.estimation.points import Observations
 
 from .projection import (
     ALONE,
@@ -36,7 +37,7 @@ def packed(points, rays, direction, shift=0.0, seat=ALONE):
     axes, centres = (np.stack(both) for both in zip(ALONE, seat, strict=True))
     mounts = Mounts(axes, centres, np.stack([np.ones(2), gradient(direction)]))
     second = np.ones(len(points), np.int64)
-    made = observations.Observations.of(points, moved, tau, jacobian_of(moved), mounts, second)
+    made = Observations.of(points, moved, tau, jacobian_of(moved), mounts, second)
     return made.packed, tau
 
 
@@ -65,7 +66,7 @@ def test_normal_equations_are_those_of_the_forward_projection(direction, seat):
     shift = np.array([2e-3, -3e-3])
     data, _ = packed(points, rays, direction, shift, seat)
     information, slope = np.empty((18, 18)), np.empty(18)
-    cost = residuals.normal_equations(data, state, 100.0, 0.0, 2, information, slope)
+    cost = projection.normal_equations(data, state, 100.0, 0.0, 2, information, slope)
     assert cost == pytest.approx(len(points) * shift @ shift, rel=1e-3)
     expected = np.einsum("nci,ncj->ij", jacobian, jacobian)
     scale = np.sqrt(np.diag(expected))
@@ -88,7 +89,7 @@ def test_lines_are_those_of_the_forward_projection(direction, coefficients, seat
     h = 1e-5
     rates = (shake(tau + h, coefficients) - shake(tau - h, coefficients)) / (2 * h)
     turns = np.column_stack([shake(tau, coefficients), rates])
-    errors, by_motion, by_turn, seen, image = residuals.linearized(data, len(points), state, turns)
+    errors, by_motion, by_turn, seen, image = projection.linearized(data, len(points), state, turns)
     np.testing.assert_allclose(errors, 0.0, atol=1e-7)
     np.testing.assert_allclose(seen, tau, atol=1e-9)
     np.testing.assert_allclose(image, rays, atol=1e-9)

@@ -15,7 +15,6 @@ from benchmarks.frames.gross import frame
 from benchmarks.frames.judged import far_off, judge
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import project_rolling
-from rs_localizer.estimation.left_out import as_nearest
 
 
 def results(scene, fault, count=6):
@@ -181,14 +180,3 @@ def test_a_fast_camera_may_leave_out_a_few_points_that_lie_near():
         points, pixels = points[seen], pixels[seen] + random.normal(0.0, 0.3, (seen.sum(), 2))
         pixels[::15] += random.uniform(-30.0, 30.0, (len(pixels[::15]), 2))
         assert rsl.Localizer(camera).localize(points, pixels)
-
-
-def test_neighbours_are_alike_by_their_distance():
-    random = np.random.default_rng(0)
-    places, errors = 300.0 * random.random((50, 2)), 30.0 * random.normal(size=(50, 2))
-    apart = np.linalg.norm(places[:, None] - places, axis=2) + np.diag(np.full(50, np.inf))
-    nearest = apart.argmin(axis=1)
-    off = np.linalg.norm(errors - errors[nearest], axis=1)
-    expected = np.count_nonzero(off < 10.0 + 0.5 * apart.min(axis=1))
-    assert 0 < expected < 50
-    assert as_nearest(places, errors, 10.0) == expected

@@ -27,7 +27,7 @@ from rs_localizer.estimation.linear_fit import (
     without,
 )
 from rs_localizer.estimation.prior import add_prior, terms_at
-from rs_localizer.estimation.residuals import linearized
+from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.smooth_error import (
     bend_of,
     nothing_shared,

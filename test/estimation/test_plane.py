@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.core import so3
-from rs_localizer.estimation.plane import leaning_less
+from rs_localizer.estimation.points import leaning_less
 
 MOTION = np.linspace(0.01, 0.12, 12)  # velocities and accelerations
 

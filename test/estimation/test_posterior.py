@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from rs_localizer.estimation.posterior import decided, noise_deviation
 from rs_localizer.estimation.prior import held_terms, motion_terms
-from rs_localizer.estimation.refine import inverted
+from rs_localizer.estimation.robust import decided, inverted, noise_deviation
 
 from .frames import fitted
 

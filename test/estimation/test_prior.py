@@ -15,7 +15,7 @@ from rs_localizer.estimation.prior import (
     with_measurements,
     with_motion,
 )
-from rs_localizer.estimation.refine import apply_step
+from rs_localizer.estimation.robust import apply_step
 
 CENTRE = np.array([10.0, -3.0, 2.0])
 

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from rs_localizer.estimation.residuals import linearized
+from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.smooth_error import bend_of, smooth_columns, smooth_error
 
 from .frames import frame

@@ -11,7 +11,7 @@ from rs_localizer.config import Acceleration
 from rs_localizer.core.state import step_between
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.prior import Prior, motion_terms, state_in, with_motion
-from rs_localizer.estimation.refine import apply_step
+from rs_localizer.estimation.robust import apply_step
 from rs_localizer.estimation.window import (
     LENGTH,
     Gaussian,

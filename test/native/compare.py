@@ -26,7 +26,7 @@ DETERMINED = {
     "rs_localizer.estimation.smooth_error.smooth_error": lambda smooth: (
         smooth.rows @ smooth.rows.T, *smooth[1:]
     ),
-    "rs_localizer.estimation.plane.plane_of": lambda plane: (
+    "rs_localizer.estimation.points.plane_of": lambda plane: (
         *plane[:2], np.outer(plane[2], plane[2])
     ),
 }  # fmt: skip

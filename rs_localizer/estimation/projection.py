@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reprojection errors of many points under one motion, and their normal equations.
 
-Points lie in lanes (:func:`rs_localizer.estimation.observations.pack`); a motion is a state of
+Points lie in lanes (:func:`rs_localizer.estimation.points.pack`); a motion is a state of
 :mod:`rs_localizer.core.state`. Each point is seen by a camera of a rig. The motion of the rig takes
 the point to its place ``Y`` before the rig at its row time. The camera, whose centre in the rig is
 ``c`` and whose axes are ``R``, sees it at ``R (Y - c)``. A single camera is its own rig.
@@ -397,8 +397,8 @@ def normal_equations(
 ) -> float:
     """Fill ``information`` (p,p) = J^T W J and ``slope`` (p,) = J^T W e; returns the cost.
 
-    ``looks`` at each point's row, see :class:`rs_localizer.estimation.residuals.View`: 1 for the 12
-    parameters of a search, 2 for all 18.
+    ``looks`` at each point's row, see :class:`rs_localizer.estimation.projection.View`: 1 for
+    the 12 parameters of a search, 2 for all 18.
     """
     uniform = np.empty(UNIFORM_SIZE * LANES)
     spread_state(state, scale, softness, uniform)
@@ -476,25 +476,3 @@ def linearized(data: Array2, count: int, state: Array1, shake: Array2) -> Lines:
                 image[i, row] = lines[(2 * _LINE + row) * LANES + lane]
             tau[i] = lines[(2 * _LINE + 2) * LANES + lane]
     return Lines(errors, by_motion, by_turn, tau, image)
-
-
-@entry
-def likeness(points: Array2, numbers: Array1, neighbours: int) -> float:
-    """Return the mean product of numbers (n,) of points (n,3) and of their neighbours."""
-    count, total = len(points), 0.0
-    far, near = np.empty(neighbours), np.empty(neighbours)
-    for i in range(count):
-        far[:] = np.inf
-        for j in range(count):
-            square = 0.0
-            for axis in range(3):
-                square += (points[i, axis] - points[j, axis]) ** 2
-            if j == i or not square < far[neighbours - 1]:
-                continue
-            place = neighbours - 1
-            while place > 0 and square < far[place - 1]:
-                far[place], near[place] = far[place - 1], near[place - 1]
-                place -= 1
-            far[place], near[place] = square, numbers[j]
-        total += numbers[i] * near.sum()
-    return total / (count * neighbours)

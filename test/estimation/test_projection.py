@@ -5,8 +5,9 @@
 import numpy as np
 import pytest
 
-from rs_localizer.estimation import residuals
-from rs_localizer.estimation.refine import apply_step
+from rs_localizer.estimation import projection
+from rs_localizer.estimation.robust import apply_step
+from rs_localizer.integrity import likeness
 
 
 @pytest.mark.parametrize("softness", [0.0, 1.0])
@@ -17,7 +18,7 @@ def test_robust_cost_and_its_slope_belong_together(scene, softness):
     information, slope = np.empty((18, 18)), np.empty(18)
 
     def cost_of(s):
-        return residuals.normal_equations(data, s, scale, softness, 2, information, slope)
+        return projection.normal_equations(data, s, scale, softness, 2, information, slope)
 
     steps = [sign * h * np.eye(18)[k] for k in range(18) for sign in (1, -1)]
     around = [cost_of(apply_step(state, step)) for step in steps]
@@ -28,12 +29,12 @@ def test_robust_cost_and_its_slope_belong_together(scene, softness):
 
 
 def test_truncated_costs_are_those_of_the_formulas(as_python, scene):
-    truncated_cost = as_python(residuals.truncated_cost)
+    truncated_cost = as_python(projection.truncated_cost)
     # A search's cost is that of its one look, which knows no accelerations.
     camera, motion, points, _, measured = scene.frame(noise=2.0, seed=5)
     data = scene.pack(camera, points, measured, np.zeros(2))
     state = scene.state_of(motion)
-    squared, c2 = residuals.squared_errors(data, len(points), state), 9.0
+    squared, c2 = projection.squared_errors(data, len(points), state), 9.0
     assert (squared > c2).any()
     assert (squared < c2).any()
     truncated = truncated_cost(data, state, 3.0, np.inf)
@@ -41,7 +42,7 @@ def test_truncated_costs_are_those_of_the_formulas(as_python, scene):
     information, slope = np.empty((18, 18)), np.empty(18)
     tukey = c2 / 3 * (1 - (1 - np.minimum(squared / c2, 1)) ** 3)
     for softness, expected in ((0.0, truncated), (1.0, tukey.sum())):
-        assert residuals.normal_equations(
+        assert projection.normal_equations(
             data, state, 3.0, softness, 2, information, slope
         ) == pytest.approx(expected)
     bounded = truncated_cost(data, state, 3.0, 0.1 * truncated)
@@ -55,13 +56,13 @@ def test_points_behind_the_camera_are_outliers_and_disturb_nothing(scene):
     behind[0] = points[0] - 2 * depth[0] * motion.rotation[2]
     state = scene.state_of(motion)
     data = scene.pack(camera, behind, measured)
-    squared = residuals.squared_errors(data, len(points), state)
+    squared = projection.squared_errors(data, len(points), state)
     assert np.isinf(squared[0])
     assert squared[1:].max() < 1e-6
     information, slope = np.empty((18, 18)), np.empty(18)
     without = np.empty((18, 18))
-    residuals.normal_equations(data, state, 3.0, 0.0, 2, information, slope)
-    residuals.normal_equations(
+    projection.normal_equations(data, state, 3.0, 0.0, 2, information, slope)
+    projection.normal_equations(
         scene.pack(camera, points[1:], measured[1:]), state, 3.0, 0.0, 2, without, slope
     )
     np.testing.assert_allclose(information, without, rtol=1e-9, atol=1e-6)
@@ -73,4 +74,4 @@ def test_likeness_is_the_mean_over_nearest_neighbours():
     far = np.linalg.norm(points[:, None] - points, axis=2)
     nearest = np.argsort(far, axis=1)[:, 1:5]  # the first is the point itself
     expected = np.mean(numbers[:, None] * numbers[nearest])
-    assert residuals.likeness(points, numbers, 4) == pytest.approx(expected, abs=1e-14)
+    assert likeness(points, numbers, 4) == pytest.approx(expected, abs=1e-14)

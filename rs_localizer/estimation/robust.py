@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Refinement of a motion on many points: Levenberg-Marquardt in model B, with a prior.
+"""The best motion of a frame: Levenberg-Marquardt with a prior; inliers by noise, noise by inliers.
 
 Parameters of a step, as in ``Estimate.covariance``: the camera turns by ``exp([phi]x)`` in its own
 axes, moves by ``rho`` along them, and velocities and accelerations change additively.
@@ -8,13 +8,17 @@ axes, moves by ``rho`` along them, and velocities and accelerations change addit
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import numpy as np
 
-from rs_localizer.core.arrays import Array, Array1, Array2
+from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray1, Out
 from rs_localizer.core.so3 import exp
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
+from rs_localizer.estimation.points import weighted
 from rs_localizer.estimation.prior import PriorTerms, add_prior
-from rs_localizer.estimation.residuals import normal_equations
+from rs_localizer.estimation.projection import normal_equations, squared_errors
 from rs_localizer.native import entry, inlined, kernel
 
 EXPECTED_NOISE = 0.5
@@ -97,8 +101,7 @@ def solve_positive(matrix: Array2, right: Array1) -> tuple[Array, bool]:
 def _posterior(
     data: Array,
     state: Array,
-    scale: float,
-    softness: float,
+    loss: tuple[float, float],
     prior: PriorTerms,
     noise: float,
     looks: int,
@@ -106,7 +109,7 @@ def _posterior(
     slope: Array,
 ) -> float:
     """Return normal equations and cost with the prior, in squared pixels."""
-    cost = normal_equations(data, state, scale, softness, looks, information, slope)
+    cost = normal_equations(data, state, loss[0], loss[1], looks, information, slope)
     return cost + add_prior(prior, state, noise * noise, information, slope)
 
 
@@ -114,8 +117,7 @@ def _posterior(
 def refine(
     data: Array2,
     start: Array1,
-    scale: float,
-    softness: float,
+    loss: tuple[float, float],
     prior: PriorTerms,
     noise: float,
     looks: int,
@@ -127,10 +129,10 @@ def refine(
     Args:
         data: packed points, with weights.
         start: state (24,).
-        scale, softness: of the robust loss, see :mod:`rs_localizer.estimation.residuals`.
+        loss: scale (px) and softness, see :mod:`rs_localizer.estimation.projection`.
         prior: see :mod:`rs_localizer.estimation.prior`.
         noise: standard deviation of the pixels, against which the prior is weighed.
-        looks: at each point's row, 1 or 2 (see :class:`rs_localizer.estimation.residuals.View`);
+        looks: at each point's row, 1 or 2 (see :class:`rs_localizer.estimation.projection.View`);
             1 holds the accelerations.
         iterations: most steps.
         tolerance: a step that gains less than this, in noise variances, is the last one, and
@@ -146,7 +148,7 @@ def refine(
     slope = np.empty(size)
     next_information = np.empty((size, size))
     next_slope = np.empty(size)
-    cost = _posterior(data, state, scale, softness, prior, noise, looks, information, slope)
+    cost = _posterior(data, state, loss, prior, noise, looks, information, slope)
     damping, growth = 0.0, _GROWTH
     converged = False
     for _ in range(iterations):
@@ -166,7 +168,7 @@ def refine(
                 # So near the optimum an evaluation at the new state would change nothing.
                 return trial, information, cost - gain, True
             trial_cost = _posterior(
-                data, trial, scale, softness, prior, noise, looks,
+                data, trial, loss, prior, noise, looks,
                 next_information, next_slope,
             )  # fmt: skip
             accepted = trial_cost <= cost
@@ -203,7 +205,7 @@ def anneal(
     slope = np.empty(MOTION_PARAMETERS)
     scale = first_scale
     while scale > last_scale:
-        _posterior(data, state, scale, 1.0, prior, noise, 1, information, slope)
+        _posterior(data, state, (scale, 1.0), prior, noise, 1, information, slope)
         for i in range(MOTION_PARAMETERS):
             information[i, i] *= 1.0 + _ANNEALING_DAMPING
         step, solved = solve_positive(information, -slope)
@@ -277,18 +279,122 @@ def squared(half: Array, scale: Array) -> Array:
     return inverse
 
 
+# Inliers lie within this many standard deviations of the measured noise (99.8 % of Rayleigh
+# distributed errors); the threshold is widened for them at most twofold.
+GATE = 3.5
+WIDEST_GATE = 2.0
+_ROUNDS = 3
+_ITERATIONS = 50
+# Gain of a last step, noise variances: of the first round, whose inliers are not the last ones, and
+# of the others.
+_FIRST, _LATER = 1e-2, 1e-4
+# A truncation that truncates nothing, px.
+_NO_SCALE = 1e6
+_NOISE_ROUNDS = 20
+
+
+class Best(NamedTuple):
+    """The best motion of a frame, and what the points say of it."""
+
+    state: Array1  # (24,)
+    covariance: Array2  # (18,18)
+    noise: float  # px, measured standard deviation
+    freedom: float  # of the errors
+    smallest_eigenvalue: float  # of the information scaled to a unit diagonal, or less
+    inliers: BoolArray1  # (n,)
+    squared_errors: Array1  # (n,) px^2
+
+
 @entry
-def smallest_eigenvalue(information: Array2) -> float:
-    """Return the least eigenvalue of information scaled to a unit diagonal; 0 if none."""
-    size = len(information)
-    scaled = np.empty((size, size))
-    for i in range(size):
-        if not information[i, i] > 0.0:
-            return 0.0
-    for i in range(size):
-        for j in range(size):
-            scaled[i, j] = information[i, j] / np.sqrt(information[i, i] * information[j, j])
-            if not np.isfinite(scaled[i, j]):
-                return 0.0
-    smallest: float = np.linalg.eigvalsh(scaled)[0]
-    return smallest
+def noise_deviation(squared_errors: Array1, gate: float, freedom: float) -> float:
+    """Return the standard deviation of the pixel noise from the errors within a gate.
+
+    Args:
+        squared_errors: (n,) of all points.
+        gate: px.
+        freedom: degrees of freedom that the fit has used up.
+
+    The errors of true inliers are Rayleigh distributed; cutting them off at the gate lowers their
+    mean square by a factor that depends on the deviation itself, hence the fixed point.
+    """
+    total, left = 0.0, -freedom
+    for squared in squared_errors:
+        if squared < gate * gate:
+            total += squared
+            left += 2.0
+    if left <= 0.0:
+        return gate / GATE
+    mean = total / left
+    variance = mean
+    for _ in range(_NOISE_ROUNDS):
+        u = gate * gate / (2.0 * max(variance, 1e-12 * gate * gate))
+        kept = 1.0 - u * math.exp(-u) / -math.expm1(-u)
+        variance = min(mean / max(kept, 1e-3), gate * gate)
+    return max(math.sqrt(variance), LEAST_NOISE)
+
+
+@inlined
+def decided(inverse: Array2, prior: PriorTerms, noise: float) -> float:
+    """Count the parameters that the points decide, and not the prior.
+
+    Args:
+        inverse: (18,18) of the information of both, px^-2.
+        noise: px, the one that the prior was weighed against.
+    """
+    size = len(inverse)
+    total = float(size)
+    for term in range(len(prior.informations)):
+        for i in range(size):
+            for j in range(size):
+                total -= noise * noise * inverse[i, j] * prior.informations[term, i, j]
+    return max(total, 0.0)
+
+
+@inlined
+def _least_eigenvalue(information: Array, inverse: Array) -> float:
+    """Return a bound below the least eigenvalue for a unit diagonal: one over the inverse's trace.
+
+    It is less by the number of parameters at most; 0 where there is no inverse.
+    """
+    total = 0.0
+    for i in range(len(information)):
+        total += inverse[i, i] * information[i, i]
+    return 1.0 / total if total > 0.0 else 0.0
+
+
+@entry
+def best_motion(
+    data: Out[Array2], count: int, start: Array1, prior: PriorTerms, threshold: float
+) -> Best:
+    """Refine a motion, measure the noise, choose the inliers, and again.
+
+    Args:
+        data: packed points, ``count`` of them.
+        start: state (24,).
+        threshold: px, least gate for inliers.
+    """
+    # The gate closes from the wide side: a start that fits few points well would see little noise
+    # and keep few.
+    state, gate, noise, freedom = start, WIDEST_GATE * threshold, EXPECTED_NOISE * threshold, 0.0
+    errors = squared_errors(data, count, state)
+    weights = np.empty(count)
+    information = np.empty((PARAMETERS, PARAMETERS))
+    inverse = information
+    for turn in range(_ROUNDS):
+        for i in range(count):
+            weights[i] = 1.0 if errors[i] < gate * gate else 0.0
+        state, information, _, _ = refine(
+            weighted(data, weights), state, (_NO_SCALE, 0.0), prior, noise, 2, _ITERATIONS,
+            _FIRST if turn == 0 else _LATER,
+        )  # fmt: skip
+        errors = squared_errors(data, count, state)
+        inverse = inverted(information)
+        # The prior takes its part of the parameters that the points decide.
+        freedom = decided(inverse, prior, noise)
+        noise = noise_deviation(errors, gate, freedom)
+        gate = min(max(threshold, GATE * noise), WIDEST_GATE * threshold)
+    inliers = errors < gate * gate
+    return Best(
+        state, noise * noise * inverse, noise, 2.0 * np.sum(inliers) - freedom,
+        _least_eigenvalue(information, inverse), inliers, errors,
+    )  # fmt: skip

@@ -5,14 +5,13 @@ import pytest
 
 from rs_localizer.core import so3
 from rs_localizer.estimation.prior import motion_terms
-from rs_localizer.estimation.refine import (
+from rs_localizer.estimation.projection import squared_errors
+from rs_localizer.estimation.robust import (
     apply_step,
     inverted,
     refine,
-    smallest_eigenvalue,
     solve_positive,
 )
-from rs_localizer.estimation.residuals import squared_errors
 
 NO_PRIOR = motion_terms((0.0, 0.0), (0.0, 0.0))
 
@@ -53,7 +52,7 @@ def test_the_truth_is_found_from_a_global_shutter_start(scene):
     start[12:] = 0.0
     start = apply_step(start, 0.05 * np.random.default_rng(0).normal(size=18))
     state, _, cost, converged = refine(
-        scene.pack(camera, points, true), start, 1e3, 0.0, NO_PRIOR,
+        scene.pack(camera, points, true), start, (1e3, 0.0), NO_PRIOR,
         1e-3, 2, 30, 1e-6,
     )  # fmt: skip
     assert converged
@@ -68,7 +67,7 @@ def test_the_minimum_has_no_slope_of_the_posterior(scene):
     data = scene.pack(camera, points, measured, np.zeros(2))
     prior, noise, h = motion_terms((0.2, 0.1), (0.1, 0.05)), 0.5, 1e-6
     precisions = np.repeat([25.0, 100.0, 100.0, 400.0], 3)
-    state = refine(data, scene.state_of(motion), 1e3, 0.0, prior, noise, 2, 50, 1e-6)[0]
+    state = refine(data, scene.state_of(motion), (1e3, 0.0), prior, noise, 2, 50, 1e-6)[0]
 
     def posterior(s):
         changes = s[12:]
@@ -89,7 +88,6 @@ def test_the_minimum_has_no_slope_of_the_posterior(scene):
 def test_a_matrix_that_is_not_positive_is_refused():
     for matrix in (np.zeros((2, 2)), np.ones((2, 2)), -np.eye(2), np.diag([1.0, np.nan])):
         assert not solve_positive(matrix, np.ones(2))[1]
-        assert not smallest_eigenvalue(matrix) > 1e-12
         assert np.isnan(inverted(matrix)).all()
 
 

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The points of one frame: checked, chosen, and packed once for all kernels."""
+"""The points of one frame: checked, chosen, and packed once for all kernels; planes of them."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rs_localizer.core import so3
 from rs_localizer.core.arrays import (
     Array,
     Array1,
@@ -28,17 +29,15 @@ from rs_localizer.core.blocks import median
 from rs_localizer.core.gyro_rotation import GyroRotation, gyro_compensated
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Mounts, Rig
-from rs_localizer.core.shutter import Motion
 from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.types import Failure
-from rs_localizer.estimation.prior import Assumed, PriorTerms, state_in
-from rs_localizer.estimation.residuals import (
+from rs_localizer.estimation.prior import Assumed, PriorTerms
+from rs_localizer.estimation.projection import (
     AXES,
     CENTRE,
     GRADIENT,
     POINT_SIZE,
     WEIGHT,
-    Lines,
     linearized,
     squared_errors,
 )
@@ -324,22 +323,6 @@ def relinearized(
     )  # fmt: skip
 
 
-def lines_about(
-    exposure: Exposure,
-    points: Array,
-    pixels: Array,
-    motion: Motion,
-    turn: GyroRotation | None = None,
-) -> Lines:
-    """Linearize the sound points (n,3) and pixels (n,2) of a single camera at a motion."""
-    usable = find_usable(exposure, points, pixels, [len(pixels)], turn)
-    seen = packed(exposure, points, usable)
-    state, count = state_in(motion, usable.centre), len(seen)
-    lines = linearized(seen.packed, count, state, np.zeros((count, 6)))
-    sound = np.isfinite(lines.errors).all(axis=1)
-    return Lines(*(part[sound] for part in lines))
-
-
 def rays_of_lens(turn: GyroRotation | None, tau: Array, rays: Array) -> Array:
     """Return rays (n,2) at row times (n,) with the known rotation that was taken out."""
     if turn is None:
@@ -505,3 +488,72 @@ def _packed(
         for axis in range(3):
             near[i, axis] -= centre[axis]
     return near, bearing, times, chosen, pack(near, bearing, times, by_ray[indices], chosen, mounts)
+
+
+# Points whose depth relief is a smaller part than this of their narrower extent are a plane.
+_PLANE = 0.1
+# A plane that leans by less (rad) faces the camera.
+_LEAST_LEAN = 0.01
+
+
+@entry
+def leaning_less(
+    points: Array2, inliers: BoolArray1, state: Array1, leans: float
+) -> tuple[bool, Array]:
+    """Return True and the state (24,) with the plane's lean reduced so many times.
+
+    Twice its lean less it is mirrored, once it faces the camera. False if the points (n,3) that
+    count are no plane, or face the camera.
+    """
+    plane, centre, axis_of_plane = plane_of(points, inliers)
+    if not plane:
+        return False, state
+    seen, normal = state[9:12].copy(), np.zeros(3)
+    for i in range(3):
+        for k in range(3):
+            seen[i] += state[3 * i + k] * centre[k]
+            normal[i] += state[3 * i + k] * axis_of_plane[k]
+    sight = seen / np.sqrt(np.sum(seen * seen))
+    normal *= np.sign(np.sum(sight * normal))
+    axis = np.empty(3)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        axis[i] = sight[j] * normal[k] - sight[k] * normal[j]
+    length = np.sqrt(np.sum(axis * axis))
+    lean = np.arcsin(min(length, 1.0))
+    if lean < _LEAST_LEAN:
+        return False, state
+    flip = so3.exp(-leans * lean / length * axis)
+    other = state.copy()
+    for i in range(3):
+        other[9 + i] = seen[i]
+        for k in range(3):
+            other[9 + i] += flip[i, k] * (state[9 + k] - seen[k])
+            other[3 * i + k] = 0.0
+            for m in range(3):
+                other[3 * i + k] += flip[i, m] * state[3 * m + k]
+    return True, other
+
+
+@entry
+def plane_of(points: Array2, inliers: BoolArray1) -> tuple[bool, Array, Array]:
+    """Return True if the counted points lie on a plane, its centre (3,) and normal (3,)."""
+    centre, spread, count = np.zeros(3), np.zeros((3, 3)), 0
+    for i in range(len(points)):
+        if inliers[i]:
+            count += 1
+            for k in range(3):
+                centre[k] += points[i, k]
+    if count == 0:
+        return False, centre, centre
+    centre /= count
+    for i in range(len(points)):
+        if inliers[i]:
+            for j in range(3):
+                for k in range(j + 1):
+                    spread[j, k] += (points[i, j] - centre[j]) * (points[i, k] - centre[k])
+    for j in range(3):
+        for k in range(j):
+            spread[k, j] = spread[j, k]
+    extents, axes = np.linalg.eigh(spread)
+    return extents[0] < _PLANE**2 * extents[1], centre, axes[:, 0].copy()

@@ -1,22 +1,26 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The robust loop: draw samples in blocks, solve, score, optimize the best, stop when sure.
+"""The search for the motion of an image: a global-shutter start, then the solver's hypotheses.
 
-It knows a solver only as a function that turns samples into models.
+The robust loop draws samples in blocks, solves, scores, optimizes the best, and stops when it is
+sure. It knows a solver only as a function that turns samples into models.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from rs_localizer.config import LocalizerConfig, RefinementKind
 from rs_localizer.core.arrays import (
     Array,
     Array1,
     Array2,
     Array3,
+    BoolArray,
     BoolArray1,
     IntArray,
     IntArray1,
@@ -26,11 +30,11 @@ from rs_localizer.core.arrays import (
 )
 from rs_localizer.core.blocks import write
 from rs_localizer.core.rig import Mounts
-from rs_localizer.core.state import STATE_SIZE
-from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.prior import PriorTerms
-from rs_localizer.estimation.refine import anneal, refine
-from rs_localizer.estimation.residuals import squared_errors, truncated_cost
+from rs_localizer.core.state import STATE_SIZE, rotation_of
+from rs_localizer.estimation.points import Observations, Observed, leaning_less
+from rs_localizer.estimation.prior import PriorTerms, held_terms
+from rs_localizer.estimation.projection import squared_errors, truncated_cost
+from rs_localizer.estimation.robust import EXPECTED_NOISE, anneal, refine
 from rs_localizer.native import entry, inlined, kernel
 from rs_localizer.solvers.batch import MODEL_SIZE, into_rig
 from rs_localizer.solvers.table import Solver
@@ -183,6 +187,9 @@ def _draw_block(
         first, begin = last, pools.ends[k]
 
 
+# The best two hypotheses of every block are optimized: a six-point model of inliers alone is often
+# not the first in a block, because noise makes it miss most of the other inliers.
+_KEEP = 2
 # Iterations of local optimization at the last scale.
 _ITERATIONS = 3
 # Steps of a descent: at its first scale, where it has far to go, and at each of the others.
@@ -205,28 +212,28 @@ def state_of_model(model: Array) -> Array:
     return state
 
 
-@kernel
+@entry
 def best_models(
-    models: Array, data: Array, scale: float, keep: int, bar: float
+    models: Out[Array3], camera: IntArray1, mounts: Mounts, data: Array2, scale: float, bar: float
 ) -> tuple[Array, Array]:
-    """Return states (keep,24) and costs (keep,) of models (k,18,h) with the least truncated error.
+    """Return states (k,24) and costs (k,) of the models with the least truncated error.
 
+    Models (k,18,h) are those of cameras (h,), and become those of their rig.
     A model is left as soon as its cost exceeds that of the worst kept one, or ``bar``. Places that
     no model takes have infinite cost.
     """
-    states = np.zeros((keep, STATE_SIZE))
-    costs = np.empty(keep)
-    costs[:] = np.inf
+    into_rig(models, camera, mounts)
+    states, costs = np.zeros((_KEEP, STATE_SIZE)), np.full(_KEEP, np.inf)
     solutions, _, count = models.shape
     for h in range(count):
         for s in range(solutions):
             if np.isnan(models[s, 0, h]):
                 continue
             state = state_of_model(models[s, :, h])
-            limit = min(costs[keep - 1], bar)
+            limit = min(costs[_KEEP - 1], bar)
             cost = truncated_cost(data, state, scale, limit)
             if cost < limit:
-                place = keep - 1
+                place = _KEEP - 1
                 while place > 0 and cost < costs[place - 1]:
                     costs[place] = costs[place - 1]
                     write(states[place], states[place - 1])
@@ -258,7 +265,7 @@ def optimize(
             continue
         state = anneal(data, states[i], first_scale, last_scale, prior, noise)
         state, _, _, _ = refine(
-            data, state, last_scale, 1.0, prior, noise, 1, _ITERATIONS, _TOLERANCE
+            data, state, (last_scale, 1.0), prior, noise, 1, _ITERATIONS, _TOLERANCE
         )
         cost = truncated_cost(data, state, last_scale, best_cost)
         if cost < best_cost:
@@ -281,15 +288,11 @@ def descend(
     """
     state, scale, iterations = start, first_scale, _FIRST_STEPS
     while scale > last_scale:
-        state, _, _, _ = refine(data, state, scale, 1.0, prior, noise, 1, iterations, _TOLERANCE)
+        state, _, _, _ = refine(data, state, (scale, 1.0), prior, noise, 1, iterations, _TOLERANCE)
         scale, iterations = _RATIO * scale, _STEPS
-    state, _, _, _ = refine(data, state, last_scale, 1.0, prior, noise, 1, _FIRST_STEPS, _TOLERANCE)
+    loss = last_scale, 1.0
+    state, _, _, _ = refine(data, state, loss, prior, noise, 1, _FIRST_STEPS, _TOLERANCE)
     return state, truncated_cost(data, state, last_scale, np.inf)
-
-
-# The best two hypotheses of every block are optimized: a six-point model of inliers alone is often
-# not the first in a block, because noise makes it miss most of the other inliers.
-_KEEP = 2
 
 
 class Candidate(NamedTuple):
@@ -343,12 +346,11 @@ def search(
     model counts, and the search ends late.
     """
     solver, pools, mounts = hypotheses.solver, draws.pools, observations.mounts
-    scales = hypotheses.score_scale, hypotheses.final_scale, hypotheses.noise
-    state, cost, used = start.state, start.cost, len(pools.ends)
-    drawn, shares = np.zeros(used, np.int64), np.full(used, np.nan)
-    rotations = mounts.axes @ draws.rotation
-    no_fit, best_gain = observations.count * hypotheses.score_scale**2, 0.0
-    left = draws.most if used else 0
+    score, final, noise = hypotheses.score_scale, hypotheses.final_scale, hypotheses.noise
+    best, shares, drawn = start, None, np.zeros(len(pools.ends), np.int64)
+    rotations, data = mounts.axes @ draws.rotation, observations.packed
+    bar = observations.count * score**2
+    left = draws.most if len(drawn) else 0
     while left > 0:
         samples = np.empty((min(hypotheses.block, left), solver.sample_size), np.int64)
         _draw_block(pools, drawn, observations.tau, draws.random, samples)
@@ -358,59 +360,172 @@ def search(
             observations.points, observations.rays, observations.tau, samples, rotations[camera],
             hypotheses.iterations, models,
         )  # fmt: skip
-        state, cost, least, missed = _judge(
-            models, camera, mounts, observations.packed, observations.count, state, cost, scales,
-            no_fit - best_gain, prior, pools, drawn, shares, solver.sample_size,
-            hypotheses.optimized,
-        )  # fmt: skip
-        best_gain = max(best_gain, no_fit - least)
+        states, costs = best_models(models, camera, mounts, data, score, bar)
+        found = Candidate(states[0], costs[0])
+        if hypotheses.optimized:
+            found = Candidate(*optimize(states, costs, data, 2.0 * score, final, prior, noise))
+        if found.cost < best.cost:
+            best, shares = found, None
+        if shares is None and best.found:
+            near = observations.within(best.state, final)
+            of_pools = np.split(near[pools.points], pools.ends[:-1])
+            shares = np.array([np.mean(each) for each in of_pools])
+        bar = min(bar, costs[0])
         left = draws.most - int(drawn.sum())
+        # The chance that none of the samples held inliers alone.
+        missed = 1.0 if shares is None else np.prod((1.0 - shares**solver.sample_size) ** drawn)
         if missed < 1.0 - draws.confidence:
             break
-    return Candidate(state, cost, int(drawn.sum()))
+    return best._replace(samples=int(drawn.sum()))
+
+
+# A global-shutter pose under motion misses the points of the first and last rows by a good part
+# of the image; it only has to be right to some degrees. In focal lengths.
+GLOBAL_SHUTTER_SCALE = 0.05
+_POOL_SCALE = 0.12
+# Minimal models are scored at this multiple of the inlier threshold: noise makes a six-point
+# model miss the other inliers. At 4 or 3 times a model between two groups of points that are four
+# thresholds apart was the best one in 13 or 6 of 80 frames.
+SCORE_SCALE = 2.0
+_GLOBAL_SHUTTER_BLOCK = 48
+_BLOCK = 64
+# A start, or a motion of left-out points, draws at most so many: of a fast camera one pose explains
+# so few points that the search would not end, and 70 to 80 % of outliers need no more (239 frames).
+_FEW_SAMPLES = 384
+# A start leads nowhere if its own motion fits less than this part of the points near it.
+_AGREEING = 0.5
+# Samples of left-out points: enough to find three inliers if two fifths are inliers.
+_START_SAMPLES = 96
+
+
+class MotionSearch:
+    """Finds the motion that most points of a frame agree on."""
+
+    def __init__(
+        self, focal_length: float, config: LocalizerConfig, solver: Solver, start: Solver
+    ) -> None:
+        self._config = config
+        self._solver = solver
+        self._start = start  # a global-shutter solver
+        self._near = _POOL_SCALE * focal_length
+        threshold = config.inlier_threshold
+        self._noise = EXPECTED_NOISE * threshold
+        self._optimizes = config.refinement != RefinementKind.NONE
+        expected = self._noise, config.solver_iterations
+        wide = max(GLOBAL_SHUTTER_SCALE * focal_length, threshold)
+        self._rough = wide
+        score = (SCORE_SCALE if self._optimizes else 1.0) * threshold
+        scales = (wide, wide) if solver.rolling_shutter else (score, threshold)
+        self._starts = Hypotheses(
+            start, _GLOBAL_SHUTTER_BLOCK, *scales, *expected, optimized=self._optimizes
+        )
+        self._motions = Hypotheses(
+            solver, _BLOCK, score, threshold, *expected, optimized=self._optimizes
+        )
+
+    def find(self, observed: Observed) -> Candidate:
+        """Find the motion from a global-shutter start, or nothing."""
+        most = self._config.max_iterations
+        if not self._solver.rolling_shutter:
+            return self._global_shutter(observed, most)
+        start = self._global_shutter(observed, min(_FEW_SAMPLES, most))
+        return self._motion(observed, start, most)
+
+    def among(self, observed: Observed, chosen: BoolArray, least: int) -> Candidate:
+        """Find the motion of these points alone, if more than so many roughly share a pose."""
+        part = replace(
+            observed, observations=observed.observations.only(np.flatnonzero(chosen)),
+            ranking=observed.ranking[:0],
+        )  # fmt: skip
+        start = self.rough(part)
+        if (
+            not start.found
+            or np.count_nonzero(part.observations.within(start.state, self._rough)) <= least
+        ):
+            return NOTHING
+        return self._motion(part, start, _FEW_SAMPLES)
+
+    def rough(self, observed: Observed) -> Candidate:
+        """Find a pose that fits all rows of enough points roughly, or nothing."""
+        return self._global_shutter(observed, _START_SAMPLES)
+
+    def _global_shutter(self, observed: Observed, most: int) -> Candidate:
+        """Find a pose that fits all rows roughly, with a wide threshold."""
+        observations = observed.observations
+        pools = pools_of(
+            observations.camera, observations.tau, len(observations.mounts.axes),
+            self._start.sample_size, np.ones(observations.count, np.bool_), observed.ranking, False,
+        )  # fmt: skip
+        draws = Draws(np.eye(3), pools, self._config.confidence, most, observed.random)
+        return search(observations, self._starts, held_terms(), draws, NOTHING)
+
+    def _motion(self, observed: Observed, start: Candidate, most: int) -> Candidate:
+        """Find the motion that most points agree on, from the solver's hypotheses."""
+        if not start.found:
+            return start
+        observations, threshold = observed.observations, self._config.inlier_threshold
+        if self._optimizes:
+            near, state, cost, agreeing = _from_start(
+                observations.packed, observations.count, start.state, self._near, threshold,
+                observed.terms, self._noise,
+            )  # fmt: skip
+            # The global-shutter pose is a hypothesis, too: at rest it is the best one.
+            first = Candidate(state, cost)
+            if agreeing < _AGREEING * np.count_nonzero(near):
+                first = self._facing(observed, start, near, first)
+        else:
+            near, first = observations.within(start.state, self._near), NOTHING
+        pools = pools_of(
+            observations.camera, observations.tau, len(observations.mounts.axes),
+            self._solver.sample_size, near, observed.ranking, True,
+        )  # fmt: skip
+        draws = Draws(
+            rotation_of(start.state), pools, self._config.confidence, most, observed.random
+        )
+        return search(observations, self._motions, observed.terms, draws, first)
+
+    def _facing(
+        self, observed: Observed, start: Candidate, near: BoolArray, found: Candidate
+    ) -> Candidate:
+        """Find a motion before a plane that faces the camera, if the start led nowhere.
+
+        Turning and moving stretch and shear the image of a plane, so that the global-shutter pose
+        leans by tens of degrees; from there the way leads to other leans, and samples of six noisy
+        points tell leaning from moving no better.
+        """
+        observations = observed.observations
+        leans, towards = leaning_less(observations.points, near, start.state, 1.0)
+        if not leans:
+            return found
+        state, cost = descend(
+            observations.packed, towards, self._near, self._config.inlier_threshold,
+            observed.terms, self._noise,
+        )  # fmt: skip
+        return Candidate(state, cost) if cost < found.cost else found
+
+    def optimize(
+        self, observed: Observed, state: Array, first_scale: float, terms: PriorTerms
+    ) -> Candidate:
+        """Optimize one state locally, down to the inlier threshold."""
+        optimized, cost = optimize(
+            state[None], np.zeros(1), observed.observations.packed, first_scale,
+            self._config.inlier_threshold, terms, self._noise,
+        )  # fmt: skip
+        return Candidate(optimized, cost)
 
 
 @entry
-def _judge(
-    models: Out[Array3], camera: IntArray1, mounts: Mounts, data: Array2, count: int, best: Array1,
-    least: float, scales: tuple[float, float, float], bar: float, prior: PriorTerms, pools: Pools,
-    drawn: IntArray1, shares: Out[Array1], size: int, optimized: bool,
-) -> tuple[Array, float, float, float]:  # fmt: skip
-    """Optimize the best of a block's models.
-
-    Args:
-        models: (k,18,h), of the cameras (h,).
-        best, least: the best optimized state so far, and its cost.
-        scales: px, truncation of minimal models and of optimized ones, expected noise.
-        bar: cost that a minimal model must stay below to be optimized.
-        drawn: (p,) samples from each pool until now, of ``size`` points.
-        shares: (p,) of its points that are inliers of the best state, kept up to date; NaN: not
-            counted yet.
-        optimized: whether the best are optimized.
-
-    Returns:
-        the best state and its cost; the least cost of a minimal model; and the chance that none of
-        the samples held inliers alone.
+def _from_start(
+    data: Array2, count: int, start: Array1, wide: float, threshold: float, prior: PriorTerms,
+    noise: float,
+) -> tuple[BoolArray, Array, float, int]:  # fmt: skip
+    """Return which points may belong to a motion with this global-shutter pose, and how many agree
+    with it; between them the motion and its cost, by local optimization.
     """
-    into_rig(models, camera, mounts)
-    score_scale, final_scale, noise = scales
-    states, costs = best_models(models, data, score_scale, _KEEP, bar)
-    state, cost = states[0], costs[0]
-    if optimized:
-        state, cost = optimize(states, costs, data, 2.0 * score_scale, final_scale, prior, noise)
-    better = cost < least
-    if better:
-        best, least = state, cost
-    if better or (least < np.inf and np.isnan(shares[0])):
-        errors, begin = squared_errors(data, count, best), 0
-        for k in range(len(drawn)):
-            inliers = 0
-            for i in pools.points[begin : pools.ends[k]]:
-                inliers += errors[i] < final_scale * final_scale
-            shares[k] = inliers / (pools.ends[k] - begin)
-            begin = pools.ends[k]
-    missed = 1.0
-    for k in range(len(drawn)):
-        if shares[k] > 0.0:
-            missed *= (1.0 - shares[k] ** size) ** drawn[k]
-    return best, least, costs[0], missed
+    near, agreeing = squared_errors(data, count, start) < wide * wide, 0
+    states = start.copy().reshape(1, STATE_SIZE)
+    state, cost = optimize(states, np.zeros(1), data, wide, threshold, prior, noise)
+    if cost < np.inf:
+        errors = squared_errors(data, count, state)
+        agreeing = int(np.count_nonzero(near & (errors < threshold * threshold)))
+    return near, state, cost, agreeing

@@ -10,7 +10,7 @@ import pytest
 
 from rs_localizer.core.shutter import Motion
 from rs_localizer.estimation.prior import motion_terms
-from rs_localizer.estimation.ransac import (
+from rs_localizer.estimation.search import (
     NOTHING,
     Draws,
     Hypotheses,
