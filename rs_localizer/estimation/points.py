@@ -22,7 +22,6 @@ from rs_localizer.core.arrays import (
     BoolArray1,
     IntArray,
     IntArray1,
-    Out,
     Random,
 )
 from rs_localizer.core.blocks import median
@@ -193,22 +192,6 @@ def pack(
     return data
 
 
-@entry
-def thin(data: Array2, chosen: IntArray1) -> Array:
-    """Pack only the chosen ones of the packed points anew."""
-    count = len(chosen)
-    blocks = (count + LANES - 1) // LANES
-    thinned = np.empty((blocks, POINT_SIZE * LANES))
-    for place in range(blocks * LANES):
-        i = chosen[min(place, count - 1)]
-        for k in range(POINT_SIZE):
-            value = data[i // LANES, k * LANES + i % LANES]
-            if k == WEIGHT and place >= count:
-                value = 0.0
-            thinned[place // LANES, k * LANES + place % LANES] = value
-    return thinned
-
-
 @kernel
 def weighted(data: Array, weights: Array | BoolArray) -> Array:
     """Return the packed points with these weights (n,): 1 or 0."""
@@ -225,32 +208,33 @@ class Observations:
     points: Array  # (n,3) m, in a frame near them
     rays: Array  # (n,2) in the axes of their cameras
     tau: Array  # (n,)
+    by_ray: Array  # (n,2,2) derivatives of the pixels
     camera: IntArray  # (n,) which of the mounted sides sees each
     mounts: Mounts
     packed: Array
-    count: int
 
     @classmethod
     def of(
         cls, points: Array, rays: Array, tau: Array, by_ray: Array, mounts: Mounts,
         camera: IntArray | None = None,
     ) -> Observations:  # fmt: skip
-        """Pack points (n,3), rays (n,2), row times (n,) and pixel derivatives (n,2,2).
-
-        ``camera`` (n,): None for those of the first one.
-        """
+        """Pack points; ``camera`` (n,): None for those of the first one."""
         if camera is None:
             camera = np.zeros(len(points), np.int64)
         packed = pack(points, rays, tau, by_ray, camera, mounts)
-        return cls(points, rays, tau, camera, mounts, packed, len(points))
+        return cls(points, rays, tau, by_ray, camera, mounts, packed)
 
     def only(self, chosen: IntArray) -> Observations:
         """Return the observations of these points."""
-        packed = thin(self.packed, chosen)
-        return Observations(
-            self.points[chosen], self.rays[chosen], self.tau[chosen], self.camera[chosen],
-            self.mounts, packed, len(chosen),
+        return Observations.of(
+            self.points[chosen], self.rays[chosen], self.tau[chosen], self.by_ray[chosen],
+            self.mounts, self.camera[chosen],
         )  # fmt: skip
+
+    @property
+    def count(self) -> int:
+        """Number of the points."""
+        return len(self.points)
 
     def __len__(self) -> int:
         return self.count
@@ -468,26 +452,11 @@ def _select(
 
 def packed(exposure: Exposure, points: Array, usable: Usable) -> Observations:
     """Pack the usable points (of these (n,3)), relative to their median."""
-    indices, mounts = usable.indices, exposure.mounts
-    near, bearing, times, of_camera, lanes = _packed(
-        points, usable.rays, usable.tau, usable.by_ray, usable.camera, indices, usable.centre,
-        mounts,
+    kept = usable.indices
+    return Observations.of(
+        points[kept] - usable.centre, usable.rays[kept], usable.tau[kept], usable.by_ray[kept],
+        exposure.mounts, usable.camera[kept],
     )  # fmt: skip
-    return Observations(near, bearing, times, of_camera, mounts, lanes, len(near))
-
-
-@entry
-def _packed(
-    points: Out[Array2], rays: Array2, tau: Array1, by_ray: Array3, camera: IntArray1,
-    indices: IntArray1,
-    centre: Array1, mounts: Mounts,
-) -> tuple[Array, Array, Array, IntArray, Array]:  # fmt: skip
-    """Return points, bearings, row times and cameras at these indices, and all packed."""
-    near, bearing, times, chosen = points[indices], rays[indices], tau[indices], camera[indices]
-    for i in range(len(near)):
-        for axis in range(3):
-            near[i, axis] -= centre[axis]
-    return near, bearing, times, chosen, pack(near, bearing, times, by_ray[indices], chosen, mounts)
 
 
 # Points whose depth relief is a smaller part than this of their narrower extent are a plane.
