@@ -95,12 +95,6 @@ def refusal(
             f"inlier_threshold of {threshold:g} px: no motion fits them, or the threshold is "
             "too small for the noise; set map_deviation, if points of the map are that far off",
         )
-    if posterior.near_outliers:
-        return Failure(
-            Reason.MODEL_ERROR,
-            f"{posterior.near_outliers} points lie just beyond the gate of {found} inliers: "
-            "unmodelled vibration, or a second motion",
-        )
     doubt = max(math.exp(-posterior.speeding / _SPEEDS_AND_ERRORS), _LEAST_OF_THE_LIMIT)
     if rolling and posterior.model_error > math.hypot(
         doubt * _MOST_MODEL_ERROR * threshold, _MOST_DECLARED * posterior.declared

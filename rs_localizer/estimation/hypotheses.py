@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, Array1, BoolArray, BoolArray1
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.shake import COMBINATIONS, RESOLVED, shake_at
 from rs_localizer.core.state import (
     LINEAR,
@@ -61,7 +61,6 @@ from rs_localizer.estimation.smooth_error import (
     nothing_shared,
     smooth_error,
 )
-from rs_localizer.native import entry, kernel
 
 # Logarithm of the odds of rest against each typical speed before any frame: errors of maps that no
 # polynomial of the image follows look like motion, and a hundred to one is what surveyed tags ask
@@ -77,17 +76,6 @@ _FAR_LESS_PROBABLE = 9.0
 # Velocities beyond doubt, in squared standard deviations (four times the 99 % quantile of six), of
 # which the prior knows less than this part: typical speeds are not weighed.
 _CLEARLY_MOVING, _LITTLE_OF_THE_PRIOR = 67.0, 0.05
-# Points just outside of the gate that are no chance: shaking may have moved them there. The corners
-# of one marker may, beside four and more others, be misplaced in the map. Beside fewer points, 12
-# or 13 are a plain motion's of 20 that shake by a degree, and 3 or 4 lie just outside: of 25 such
-# frames one was inside its region (benchmarks.frames bands).
-_MARKER = 4
-_NEAR_PART, _NEAR_GATE = 0.2, 8.0
-# Errors of points in neighbouring rows differ by less than those of any two, by so many standard
-# deviations, where it is the row that moves them.
-_WITH_ROWS = 3.0
-# Shaking of up to this (rad, 2 deg) moves points out of the gate of a motion without it.
-_LARGEST_SHAKE = 0.035
 # A fit that loses more inliers than this part leaves is another group of points.
 _KEPT = 0.9
 # Probability that does not count, of either kind of camera.
@@ -99,8 +87,6 @@ _HIDDEN_ODDS = math.log(10.0)
 _ASKS, _MAY_SHAKE = -0.5, -1.8
 # One frame tells no more of a vibration than this logarithm of odds: none is as Gaussian as that.
 _MOST_TOLD = 5.0
-# The gate closes by this factor from step to step (graduated non-convexity).
-_CLOSING = 0.6
 # A last step this short, in squared standard deviations: the next one is its square.
 _SHORT = 1e-2
 _STEPS = 20
@@ -129,7 +115,6 @@ class Posterior(NamedTuple):
     speeding: float = 0.0  # squared velocities, in deviations of what the configuration expects
     # Probabilities of the typical speeds; empty: the configured one
     speeds: Array = np.zeros(0)
-    near_outliers: int = 0  # points just beyond the gate, where they are too many to be chance
     # (18,18) with the second order of arcs, of a mixture; None: of the covariance as a Gaussian's
     arched: Array | None = None
     # (12,12) of pose and velocities, beside the covariance: vibration that hides in the noise
@@ -257,9 +242,8 @@ def _given(
     lines = linearized(data, count, best.state, np.zeros((count, 6)))
     declared = assumed.map_deviation * assumed.focal_length / depth
     size, shared = declared or ORDINARY, nothing_shared(found)
-    near, bend = 0, np.zeros((count, 0))
+    bend = np.zeros((count, 0))
     if assumed.rolling:
-        near = near_outliers(lines, best.squared_errors, best.inliers, threshold)
         if declared:
             bend = bend_of(points, best.inliers, depth / assumed.focal_length)
         if one_lens:
@@ -271,7 +255,7 @@ def _given(
     )  # fmt: skip
     return _Given(
         observations, terms, threshold, assumed,
-        best._replace(near_outliers=near, declared=declared), lines,
+        best._replace(declared=declared), lines,
         Frame(data, points, best.inliers, shared, noise, assumed.focal_length, depth), bend, size,
     )  # fmt: skip
 
@@ -342,12 +326,12 @@ def _of_outliers(given: _Given, inliers: BoolArray) -> float:
 
 def _with_turn(given: _Given, hypotheses: list[MotionHypothesis], steady: _Camera) -> list[_Camera]:
     """Return hypotheses without in-frame rotation, and with it if it is possible."""
-    wide, vibrating = given.best.near_outliers > 0, None
+    vibrating = None
     prior, odds = _expected(given.assumed)
     gain, undetected, vibrations = _hidden(given, steady.posterior, prior)
     steady = steady._replace(posterior=steady.posterior._replace(vibrations=vibrations))
     gain += odds
-    if wide or gain > _ASKS:
+    if gain > _ASKS:
         vibrating = _vibrating(given, hypotheses, steady.posterior, prior)
     if vibrating is None:
         weight = 1.0 / (1.0 + math.exp(min(_HIDDEN_ODDS - TEMPER * gain, 700.0)))
@@ -435,11 +419,9 @@ def _vibrating(
     given: _Given, hypotheses: list[MotionHypothesis], steady: Posterior, prior: TurnPrior
 ) -> _Camera | None:
     """Return hypotheses with in-frame rotation, if such a fit converges to as many points."""
-    best, threshold, wide = given.best, given.threshold, given.best.near_outliers > 0
+    best, threshold = given.best, given.threshold
     widest = WIDEST_GATE * threshold
     gate, noise = min(max(threshold, GATE * best.noise), widest), best.noise
-    if wide:
-        gate, noise = max(2.0 * widest, _LARGEST_SHAKE * given.assumed.focal_length), threshold
     now, is_last, farthest = _at(given, best.state, np.zeros(TURNS), gate), False, math.inf
     # Points decide all of the motion.
     decided = float(PARAMETERS)
@@ -460,12 +442,11 @@ def _vibrating(
         state, turn = _after(now, step)
         if is_last or not np.isfinite(state).all():
             break
-        is_closed = gate <= widest
         noise = max(found.noise, LEAST_NOISE)
-        gate = max(_CLOSING * gate, min(max(threshold, GATE * noise), widest))
-        now, is_last = _at(given, state, turn, gate), is_closed and farthest < _SHORT
+        gate = min(max(threshold, GATE * noise), widest)
+        now, is_last = _at(given, state, turn, gate), farthest < _SHORT
     kept, had = np.count_nonzero(now.inliers), np.count_nonzero(best.inliers)
-    if not (farthest < 1.0 and kept >= _KEPT * had) or (wide and found.freedom < kept):
+    if not (farthest < 1.0 and kept >= _KEPT * had):
         return None
     parts, last = [], _at(given, state, turn, math.inf)
     for one in hypotheses:
@@ -479,7 +460,6 @@ def _vibrating(
     preferences = np.array([one.preference for one in hypotheses])
     posterior = steady._replace(
         noise=found.noise, freedom=found.freedom, inliers=now.inliers, speeds=np.zeros(0),
-        near_outliers=near_outliers(last.lines, last.squares, now.inliers, threshold),
         squared_errors=last.squares, shared=given.size,
     )  # fmt: skip
     return _Camera(Gaussians(states, turns, covariances, evidences), preferences, posterior)
@@ -554,48 +534,6 @@ def _in_functions(covariance: Array) -> Array:
     half = np.hstack([covariance[:, :PARAMETERS], (COMBINATIONS @ half).reshape(size, -1)])
     turned = (COMBINATIONS @ half[PARAMETERS:].reshape(RESOLVED, -1)).reshape(-1, half.shape[1])
     return np.vstack([half[:PARAMETERS], turned])
-
-
-@entry
-def near_outliers(
-    lines: Lines, squared_errors: Array1, inliers: BoolArray1, threshold: float
-) -> int:
-    """Count points just beyond the gate, if too many for chance and moved by their rows; else 0.
-
-    A part of the points that is shifted alike is another group of points, whatever its rows.
-    """
-    within = squared_errors < (_NEAR_GATE * threshold) ** 2
-    count = int(np.count_nonzero(within & ~inliers))
-    most = np.count_nonzero(inliers)
-    shaken = count > _MARKER or most < 4 * _MARKER
-    if not (shaken and count >= _NEAR_PART * most):
-        return 0
-    return count if _go_with_rows(lines, within) > _WITH_ROWS else 0
-
-
-@kernel
-def _go_with_rows(lines: Lines, chosen: BoolArray1) -> float:
-    """Return how much less errors of neighbouring rows differ than those of any two rows: standard
-    normal if the row does not matter (von Neumann 1941).
-    """
-    order, count, mean = np.argsort(lines.tau), 0, np.zeros(2)
-    for i in order:
-        if chosen[i]:
-            mean += lines.errors[i]
-            count += 1
-    mean /= max(count, 1)
-    spread, steps, previous = 0.0, 0.0, -1
-    for i in order:
-        if not chosen[i]:
-            continue
-        for k in range(2):
-            spread += (lines.errors[i, k] - mean[k]) ** 2
-            if previous >= 0:
-                steps += 0.5 * (lines.errors[i, k] - lines.errors[previous, k]) ** 2
-        previous = i
-    if count < 4 or not spread > 0.0:
-        return 0.0
-    return (1.0 - steps / spread) * math.sqrt(float(count))
 
 
 def _clearly_moving(given: _Given) -> bool:

@@ -44,7 +44,6 @@ def reason(posterior):
         # Errors as large as the gate.
         ({"noise": 1.45}, None),
         ({"noise": 1.55}, Reason.RESIDUAL),
-        ({"near_outliers": 5}, Reason.MODEL_ERROR),
         ({"model_error": 2.9}, None),
         ({"model_error": 3.1}, Reason.MODEL_ERROR),
     ],

@@ -123,7 +123,7 @@ SEEN_IN = {
     "smooth-error": LENS, "in-frame-turn": SHAKEN, "calibration-effect": SHAKEN,
     "typical-speeds": PLANE, "grid-over-leans": PLANE, "mixture-of-steady-and-vibrating": SHAKEN,
     "too-few": GARBAGE, "undetermined": None, "uncertain": PLANE, "smooth-too-large": LENS,
-    "near-outliers": NOISE, "own-motion": HALVES, "left-out": HALVES,
+    "own-motion": HALVES, "left-out": HALVES,
     "another-matrix": FOCAL, "by-chance": ROUGH, "window": SHAKEN,
     "learnt-accelerations": SHAKEN,
 }  # fmt: skip
