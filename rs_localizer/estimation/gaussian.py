@@ -30,7 +30,9 @@ from rs_localizer.estimation.robust import apply_step
 from rs_localizer.native import entry
 
 # -(a x b)_i is a^T of the i-th of these b.
-_CROSSES = hat(np.eye(3))
+_UNIT = np.eye(3)
+_CROSSES = hat(_UNIT)
+_BY_STEP = np.diag(np.repeat([1.0, -1.0], 3))
 
 
 class Gaussians(NamedTuple):
@@ -162,24 +164,25 @@ def along_arcs(
         covariances: (k,18,18) of the offsets.
     """
     # y = (phi, d): d = -rho + [p]x phi.
-    by_step, forms, unit = np.eye(6), np.zeros((3, 6, 6)), np.eye(3)
-    by_step[MOVE, MOVE], by_step[MOVE, TURN] = -unit, hat(centre)
+    by_step, forms, count = _BY_STEP.copy(), np.zeros((3, 6, 6)), len(weights)
+    by_step[MOVE, TURN] = hat(centre)
     # -(phi x (phi x p))_i / 2 = (p_i (phi . phi) - phi_i (phi . p)) / 2
-    each = unit[:, :, None] * centre
-    forms[:, TURN, TURN] = 0.5 * centre[:, None, None] * unit
+    each = _UNIT[:, :, None] * centre
+    forms[:, TURN, TURN] = 0.5 * centre[:, None, None] * _UNIT
     forms[:, TURN, TURN] -= 0.25 * (each + each.transpose(0, 2, 1))
     # -(phi x d)_i
     forms[:, TURN, MOVE] = 0.5 * _CROSSES
-    forms[:, MOVE, TURN] = forms[:, TURN, MOVE].transpose(0, 2, 1)
+    forms[:, MOVE, TURN] = -0.5 * _CROSSES
     means, crossed = offsets[:, :6] @ by_step.T, covariances[:, :, :6] @ by_step.T
     both = by_step @ crossed[:, :6]
     products, pulls = forms @ both[:, None], (forms @ means[:, None, :, None])[..., 0]
     size = np.trace(products, axis1=2, axis2=3) + (pulls @ means[:, :, None])[..., 0]
     second = size[:, :, None] * size[:, None] + 4.0 * pulls @ both @ pulls.transpose(0, 2, 1)
-    second += 2.0 * np.einsum("kiab,kjba->kij", products, products)
+    crossings = products.transpose(0, 1, 3, 2).reshape(count, 3, 36).transpose(0, 2, 1)
+    second += 2.0 * products.reshape(count, 3, 36) @ crossings
     first = size[:, :, None] * offsets[:, None] + 2.0 * pulls @ crossed.transpose(0, 2, 1)
-    farther, along = covariance.copy(), np.tensordot(weights, first, 1)
-    farther[MOVE, MOVE] += np.tensordot(weights, second, 1)
+    farther, along = covariance.copy(), (weights @ first.reshape(count, -1)).reshape(3, -1)
+    farther[MOVE, MOVE] += (weights @ second.reshape(count, -1)).reshape(3, 3)
     farther[MOVE] += along
     farther[:, MOVE] += along.T
     return farther
