@@ -16,8 +16,6 @@ class ScanDirection(StrEnum):
     RIGHT_TO_LEFT = "right_to_left"
 
 
-ROW_BY_ROW = (ScanDirection.TOP_TO_BOTTOM, ScanDirection.BOTTOM_TO_TOP)
-
 REVERSED = {
     ScanDirection.TOP_TO_BOTTOM: ScanDirection.BOTTOM_TO_TOP,
     ScanDirection.BOTTOM_TO_TOP: ScanDirection.TOP_TO_BOTTOM,
