@@ -287,21 +287,6 @@ class PublishTf(StrEnum):
     MAP_TO_ODOM = "map_to_odom"
 
 
-@dataclass(frozen=True, slots=True)
-class Matching:
-    """How keypoints are matched with the landmarks of a map."""
-
-    ratio: float = setting(
-        0.8,
-        "A match by descriptor counts if its distance is below this part of the second-best "
-        "landmark's; 1: always",
-        (0.01, 1.0),
-    )
-
-    def __post_init__(self) -> None:
-        check(self, "matching.")
-
-
 class ImuUse(StrEnum):
     """Use of an IMU."""
 
@@ -497,7 +482,6 @@ class NodeConfig(LocalizerConfig):
         "Marker map for the topic detections, in the marker detector's format; empty: none",
         fixed=True,
     )
-    matching: Matching = field(default_factory=Matching)
     imu: Imu = field(default_factory=Imu)
     cameras: tuple[str, ...] = setting(
         NO_NAMES,

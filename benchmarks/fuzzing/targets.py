@@ -40,7 +40,7 @@ _PARAMS = b"""
     solver: r6p
     velocity_prior:
       angular: 0.1
-    matching: {by: id, ratio: 0.7}
+    imu: {use: none, wait: 0.1}
 """
 _ANCHORED_PARAMS = b"""
 /**:

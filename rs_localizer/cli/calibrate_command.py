@@ -235,7 +235,7 @@ def _correspondences(args: Options, bag: BagReader, config: NodeConfig) -> _Inpu
         raise UsageError("--board is for images; the recording has correspondences")
     topics = find_topics(bag, given_topics(args)).without(IMU)
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
-    recorded = read_recording(bag, topics, config.matching, landmarks)
+    recorded = read_recording(bag, topics, landmarks)
     camera = given_lens(args) or recorded.calibration.camera(0.0, config.scan_direction)
     frames = [(cloud.points, cloud.pixels, ids_of(cloud)) for cloud in recorded.clouds]
     if mistake := mistake_of(Localizer(camera, config), frames):

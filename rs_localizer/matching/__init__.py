@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.config import Matching
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion
@@ -37,6 +36,9 @@ from rs_localizer.matching.kernels import (
     nearest_real_within,
 )
 
+# Largest ratio of the distances to the nearest and the second-nearest landmark: it refuses 90 % of
+# the wrong matches and 5 % of the right ones (Lowe, IJCV 2004).
+_RATIO = 0.8
 _WORD_BYTES = 8
 _WORDS_AT_ONCE = 4
 # Numbers in a block of products of keypoints and landmarks: 32 MB.
@@ -298,7 +300,6 @@ class Matcher:
     def match(
         self,
         keypoints: Keypoints,
-        settings: Matching,
         camera: Camera | None = None,
         prior: Prior | None = None,
     ) -> Matches:
@@ -306,7 +307,6 @@ class Matcher:
 
         Args:
             keypoints: of one image.
-            settings: how strictly.
             camera, prior: with a predicted motion, where the landmarks are looked for.
 
         Raises:
@@ -321,7 +321,7 @@ class Matcher:
             matches, owners = self._predicted(queries, pixels, _GATE, camera, prior)
         else:
             matches, owners = self._anywhere(queries)
-        return _accepted(matches, owners, chosen, settings.ratio)
+        return _accepted(matches, owners, chosen)
 
     def choose(self, keypoints: Keypoints) -> MatchBy:
         """Choose what is compared: ids, or descriptors, which say more than a tracker's numbers.
@@ -434,7 +434,7 @@ def _best(keypoints: Keypoints, most: int) -> IntArray:
     return np.sort(np.argsort(-keypoints.scores, kind="stable")[:most])
 
 
-def _accepted(nearest: Nearest, owners: IntArray, rows: IntArray, ratio: float) -> Matches:
+def _accepted(nearest: Nearest, owners: IntArray, rows: IntArray) -> Matches:
     """Accept matches by ratio; the score is how much nearer the first landmark is."""
     first, second = nearest.distances[:, 0], nearest.distances[:, 1].copy()
     rivals = np.isfinite(second)
@@ -443,7 +443,7 @@ def _accepted(nearest: Nearest, owners: IntArray, rows: IntArray, ratio: float) 
         # keypoints.
         second[~rivals] = np.median(second[rivals])
     with np.errstate(invalid="ignore"):  # infinite against infinite: nothing there
-        good = (first < ratio * second) & (owners == np.arange(len(first)))
+        good = (first < _RATIO * second) & (owners == np.arange(len(first)))
     queries = np.flatnonzero(good)
     scores = 1.0 - first[queries] / second[queries]
     return Matches(rows[queries], nearest.landmarks[queries, 0], scores, MatchBy.DESCRIPTOR)

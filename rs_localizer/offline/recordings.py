@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer import matching
-from rs_localizer.config import Matching
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.bags import BagReader
 from rs_localizer.io.camera_info import Calibration, read_camera_info
@@ -41,9 +40,7 @@ class Recorded:
         return self.clouds[0].frame
 
 
-def read_recording(
-    bag: BagReader, topics: Topics, settings: Matching, landmarks: Map | None = None
-) -> Recorded:
+def read_recording(bag: BagReader, topics: Topics, landmarks: Map | None = None) -> Recorded:
     """Read the correspondences of a recording; keypoints are matched with its or a given map.
 
     The last usable camera_info gives the camera.
@@ -73,7 +70,7 @@ def read_recording(
                 clouds.append(read_correspondences(message))
             elif name == KEYPOINTS and matcher is not None:
                 keypoints = read_keypoints(message)
-                matches = matcher.match(keypoints, settings)
+                matches = matcher.match(keypoints)
                 clouds.append(matching.correspondences(matches, keypoints, matcher.map))
         except (MessageError, MatchError) as error:
             faults.update((str(error),))

@@ -137,7 +137,7 @@ class CameraFrames(FrameLocalizer):
         return cloud if isinstance(cloud, Refusal) else self.localize_cloud(cloud)
 
     def _localize_by_map(self, keypoints: Keypoints, prior: Prior | None) -> Localized | Refusal:
-        cloud = self._landmarks.match(keypoints, self._config.matching, self._camera, prior)
+        cloud = self._landmarks.match(keypoints, self._camera, prior)
         return cloud if isinstance(cloud, Refusal) else self._localize(cloud)
 
     def _localize(self, cloud: Correspondences) -> Localized | Refusal:

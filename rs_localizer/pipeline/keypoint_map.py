@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from rs_localizer import matching
-from rs_localizer.config import Matching
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.estimation.calibration import ErrorModes
@@ -70,11 +69,11 @@ class Landmarks:
         return by
 
     def match(
-        self, keypoints: Keypoints, settings: Matching, camera: Camera, prior: Prior | None
+        self, keypoints: Keypoints, camera: Camera, prior: Prior | None
     ) -> Correspondences | Refusal:
         """Match keypoints all over the map, or only where a motion predicts them."""
         assert self._matcher is not None
-        matches = self._matcher.match(keypoints, settings, camera, prior)
+        matches = self._matcher.match(keypoints, camera, prior)
         if len(matches) == 0:
             return Refusal(
                 Reason.NO_MATCHES,

@@ -292,7 +292,7 @@ class RigFrames(FrameLocalizer):
         by = self._landmarks.matching_by(found)
         if isinstance(by, Refusal):
             return by
-        return self._landmarks.match(found, self._config.matching, camera, None)
+        return self._landmarks.match(found, camera, None)
 
     def _localize_frame(self, images: Sequence[CameraImage]) -> Localized | Refusal:
         reference = images[0].cloud

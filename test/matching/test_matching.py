@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rs_localizer.config import Matching
 from rs_localizer.io.clouds import Keypoints
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.matching import Matcher, Visible, make_index
@@ -82,8 +81,8 @@ def test_the_two_nearest_within_the_gate(kind):
     np.testing.assert_allclose(table[owners[own], own], table.min(axis=0)[own], rtol=1e-5)
 
 
-def matched(matcher: Matcher, points: Keypoints, **settings: Any) -> dict[int, int]:
-    found = matcher.match(points, Matching(**settings))
+def matched(matcher: Matcher, points: Keypoints) -> dict[int, int]:
+    found = matcher.match(points)
     return dict(zip(found.keypoints.tolist(), found.landmarks.tolist(), strict=True))
 
 
@@ -91,7 +90,7 @@ def test_an_id_that_comes_twice_in_an_image():
     matcher = Matcher(make_map(2, ids=np.array([1, 2])))
     ids = np.array([2, 1, 2, 1])
     assert matched(matcher, keypoints(4, ids=ids)) == {0: 1, 1: 0}
-    best = matcher.match(keypoints(4, ids=ids, scores=np.array([1.0, 2.0, 3.0, 4.0])), Matching())
+    best = matcher.match(keypoints(4, ids=ids, scores=np.array([1.0, 2.0, 3.0, 4.0])))
     assert best.keypoints.tolist() == [2, 3]
     assert best.landmarks.tolist() == [1, 0]
     assert best.scores.tolist() == [3.0, 4.0]
@@ -107,9 +106,8 @@ def test_the_ratio_test():
     matcher = Matcher(make_map(2, descriptors=bits(0, 20)))
     # Distances to the landmarks: 4 and 16, 9 and 11.
     given = keypoints(2, descriptors=bits(4, 9))
-    assert matched(matcher, given, ratio=0.8) == {0: 0}
-    assert matched(matcher, given, ratio=0.25) == {}
-    found = matcher.match(given, Matching(ratio=0.8))
+    assert matched(matcher, given) == {0: 0}
+    found = matcher.match(given)
     assert found.scores.tolist() == [1.0 - 4 / 16]
 
 

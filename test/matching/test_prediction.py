@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rs_localizer.config import Matching
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera, Roi
 from rs_localizer.core.shutter import Motion, project_rolling
@@ -78,8 +77,8 @@ def test_a_prediction_tells_apart_what_looks_the_same(points):
     seen = pixels[shown] + rng.normal(0.0, 0.5, (200, 2))
     given = Keypoints(0, seen, None, descriptors[shown], None, 0)
     matcher = Matcher(Map(points, None, descriptors, "map"))
-    assert len(matcher.match(given, Matching())) == 0
-    found = matcher.match(given, Matching(), view, SURE)
+    assert len(matcher.match(given)) == 0
+    found = matcher.match(given, view, SURE)
     assert len(found) > 120
     assert np.mean(found.landmarks == shown[found.keypoints]) > 0.95
     assert len(set(found.landmarks.tolist())) == len(found)

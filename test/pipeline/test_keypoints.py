@@ -158,7 +158,7 @@ def test_a_wrong_prediction_is_found_out(frames, make_camera_info, monkeypatch):
 
     class Asked(Matcher):
         def match(self, *arguments: Any) -> Any:
-            asked.append(arguments[3] is not None)
+            asked.append(arguments[2] is not None)
             return super().match(*arguments)
 
     monkeypatch.setattr(rs_localizer.pipeline.keypoint_map, "Matcher", Asked)

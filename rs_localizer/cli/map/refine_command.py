@@ -102,7 +102,7 @@ def _recorded(
     config, args = of.config, of.args
     with open_bag(args.recording) as bag:
         topics = find_topics(bag, given_topics(args)).without(IMU)
-        recorded = read_recording(bag, topics, config.matching, landmarks)
+        recorded = read_recording(bag, topics, landmarks)
     camera = recorded.calibration.camera(config.readout_time, config.scan_direction)
     if args.calibration is not None:
         camera = replace(

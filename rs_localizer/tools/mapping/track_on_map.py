@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from rs_localizer.config import Matching, NodeConfig
+from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate, Failure
@@ -83,7 +83,7 @@ class _MapTracker:
     """One view after the other, as the node takes keypoints."""
 
     def __init__(self, landmarks: Map, camera: Camera) -> None:
-        self._matcher, self._settings = Matcher(landmarks), Matching()
+        self._matcher = Matcher(landmarks)
         self._localizer = Localizer(camera, NodeConfig(inlier_threshold=_THRESHOLD))
         self._tracker = Tracker(self._localizer) if camera.readout_time > 0.0 else None
         self._camera = camera
@@ -104,7 +104,7 @@ class _MapTracker:
     def _match(
         self, keypoints: Keypoints, prior: Prior | None
     ) -> tuple[Estimate | Failure, Matches]:
-        matches = self._matcher.match(keypoints, self._settings, self._camera, prior)
+        matches = self._matcher.match(keypoints, self._camera, prior)
         points = self._matcher.map.points[matches.landmarks]
         cloud = (points, keypoints.pixels[matches.keypoints], matches.scores)
         if self._tracker is None:
