@@ -290,9 +290,9 @@ def _replay_all(options: Options) -> None:
         params=params, map=landmarks, calibration=lens,
         parquet=None if options.parquet is None else Path(TABLE),
     )  # fmt: skip
-    files = [file for file in (params, landmarks, lens) if file is not None]
+    changed = [file.stat().st_mtime_ns for file in (params, landmarks, lens) if file is not None]
     work = functools.partial(_replay_of_many, own)
-    tasks = fleet.tasks_of(options.recordings, out.absolute(), work, repr(own), files)
+    tasks = fleet.tasks_of(options.recordings, out.absolute(), work, repr((own, changed)))
     if not options.overwrite:
         fleet.refuse_others(tasks)
     before = sum(fleet.finished(task) is not None for task in tasks)

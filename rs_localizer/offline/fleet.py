@@ -7,8 +7,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import fcntl
-import functools
-import hashlib
 import io
 import json
 import logging
@@ -18,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rs_localizer import __version__
 from rs_localizer.io.atomic_files import (
     atomic_directory,
     atomic_files,
@@ -49,65 +48,46 @@ logging.getLogger("distributed").setLevel({_SILENT})
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One recording, and all that its result depends on."""
+    """One recording, and what its result is made with."""
 
     work: Callable[[Path, Path], Figures]  # of a recording, and the folder to create
     recording: Path  # absolute, as the folder: workers are elsewhere
     folder: Path
-    identity: str
-    program: str  # of who asks
+    settings: str  # version and options, as text
 
 
 Outcome = Figures | str
 """Figures of a task that is done; of one that failed, why, in one line."""
 
 
-@functools.cache
-def program() -> str:
-    """Return the digest of the sources of this package, its version among them."""
-    files = sorted(Path(__file__).parents[1].rglob("*.py"))
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
-
-
 def tasks_of(
-    recordings: Sequence[Path], out: Path, work: Callable[[Path, Path], Figures], settings: str,
-    inputs: Sequence[Path] = (),
-) -> list[Task]:  # fmt: skip
+    recordings: Sequence[Path], out: Path, work: Callable[[Path, Path], Figures], settings: str
+) -> list[Task]:
     """Return a task for each recording, with a folder of its own below ``out``.
 
     Args:
         recordings: to be localized; duplicates are localized once.
         out: of all results.
         work: a function that can be pickled.
-        settings: all that a result depends on beside the files, as text.
-        inputs: other files that are read.
+        settings: what results are made with beside the recordings.
     """
-    known = [_fingerprint(Path(file).absolute()) for file in inputs]
     made = dict[str, Task]()
     places = {path.absolute(): path.name if path.is_dir() else path.stem for path in recordings}
     for place, name in places.items():
-        said = json.dumps([program(), settings, _fingerprint(place), known])
         if list(places.values()).count(name) > 1:
             name = f"{place.parent.name}_{name}"
         while name in made:
             name += "_"
-        identity = hashlib.sha256(said.encode()).hexdigest()
-        made[name] = Task(work, place, out / name, identity, program())
+        made[name] = Task(work, place, out / name, f"{__version__} {settings}")
     return list(made.values())
-
-
-def _fingerprint(place: Path) -> list[tuple[str, int, int]]:
-    """Return name, size and time of change (ns) of each file, instead of reading all of it."""
-    files = sorted(place.rglob("*")) if place.is_dir() else [place]
-    about = [(file, file.stat()) for file in files if file.is_file()]
-    return [(str(file), stat.st_size, stat.st_mtime_ns) for file, stat in about]
 
 
 def finished(task: Task) -> Figures | None:
     """Return the figures of a complete result of just this task; None if there is none."""
     try:
         about = json.loads((task.folder / MARKER).read_text(encoding="utf-8"))
-        return dict(about["figures"]) if about["identity"] == task.identity else None
+        of = about["recording"], about["settings"]
+        return dict(about["figures"]) if of == (str(task.recording), task.settings) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
@@ -119,7 +99,7 @@ def perform(task: Task) -> Outcome:
     """
     ignore_working_folder()  # of a worker of Dask, which another program has started
     here, (said, inner) = socket.gethostname(), (io.StringIO(), task.folder)
-    if program() != task.program:
+    if not task.settings.startswith(f"{__version__} "):
         return f"the worker on {here} has another rs_localizer: install the same"
     if not task.folder.parent.is_dir():
         return f"the worker on {here} does not see {task.folder.parent}"
@@ -134,7 +114,7 @@ def perform(task: Task) -> Outcome:
                 except OSError as error:  # what cannot be read; the folder can be written
                     raise ValueError(str(error)) from error
             (inner / LOG).write_text(said.getvalue().replace(str(inner), task.folder.name))
-            about = {"identity": task.identity, "recording": task.recording, "figures": figures}
+            about = {"recording": task.recording, "settings": task.settings, "figures": figures}
             (inner / MARKER).write_text(json.dumps(about, indent=1, default=str))
     except Exception as error:
         # Another worker, taken for lost, may have been at it, too.

@@ -84,7 +84,7 @@ def test_results_of_other_settings_are_in_the_way(recordings, tmp_path, monkeypa
     words = ["replay", *recordings, "--out", str(out), *SHUTTER]
     (out / "a_flight").mkdir(parents=True)
     (out / "a_flight" / "mine").write_text("")
-    for text in ("no marker", '{"identity": "another", "figures": {}}'):
+    for text in ("no marker", '{"settings": "another", "recording": "a", "figures": {}}'):
         (out / "a_flight" / "fleet.json").write_text(text)
         assert main(words) == 1
         assert f"{out}/a_flight exists and is no result of this" in capsys.readouterr().err
@@ -112,7 +112,7 @@ def test_what_goes_wrong_is_one_line(recordings, tmp_path, monkeypatch, capsys):
 
 def test_workers_that_cannot_do_it_say_why(tmp_path):
     (task,) = tasks_of([tmp_path / "bag"], tmp_path, _fail, "settings")
-    assert "install the same" in str(perform(dataclasses.replace(task, program="x")))
+    assert "install the same" in str(perform(dataclasses.replace(task, settings="0.1 settings")))
     elsewhere = dataclasses.replace(task, folder=tmp_path / "no" / "bag")
     assert f"does not see {tmp_path}/no" in str(perform(elsewhere))
     assert perform(task) == f"ZeroDivisionError: of {tmp_path}/bag"
