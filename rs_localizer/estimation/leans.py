@@ -154,13 +154,13 @@ def over_leans(frame: Frame, mode: Mode, terms: PriorTerms) -> Mode:
     Noise, inliers and the size of the smooth error are those of the mode.
     """
     plane, centre, normal = plane_of(frame.points, frame.chosen)
-    normal = rotation_of(mode.state) @ normal
-    flat = np.eye(3) - np.outer(normal, normal)
+    across = rotation_of(mode.state) @ normal
+    flat = np.eye(3) - np.outer(across, across)
     sizes, axes = np.linalg.eigh(flat @ mode.covariance[TURN, TURN] @ flat)
     if not (plane and sizes[2] > _KNOWN_LEAN**2):
         return mode
     # The mirrored lean may lie beyond others that are out of the question.
-    _, twin = leaning_less(frame.points, frame.chosen, mode.state, 2.0)
+    twin = leaning_less(mode.state, centre, normal, 2.0)
     away = axes.T @ step_between(mode.state, twin)[TURN]
     worst = [2, 1] if max(sizes[1], away[1] ** 2) > _KNOWN_LEAN**2 else [2]
     steps = _SPACING * np.sqrt(np.maximum(sizes[worst], TINY))

@@ -31,9 +31,9 @@ from rs_localizer.core.arrays import (
 from rs_localizer.core.blocks import write
 from rs_localizer.core.rig import Mounts
 from rs_localizer.core.state import STATE_SIZE, rotation_of
-from rs_localizer.estimation.points import Observations, Observed, leaning_less
+from rs_localizer.estimation.points import Observations, Observed, leaning_less, plane_of
 from rs_localizer.estimation.prior import PriorTerms, held_terms
-from rs_localizer.estimation.projection import squared_errors, truncated_cost
+from rs_localizer.estimation.projection import truncated_cost
 from rs_localizer.estimation.robust import EXPECTED_NOISE, anneal, refine
 from rs_localizer.native import entry, inlined, kernel
 from rs_localizer.solvers.batch import MODEL_SIZE, into_rig
@@ -192,8 +192,6 @@ def _draw_block(
 _KEEP = 2
 # Iterations of local optimization at the last scale.
 _ITERATIONS = 3
-# Steps of a descent: at its first scale, where it has far to go, and at each of the others.
-_FIRST_STEPS, _STEPS, _RATIO = 20, 3, 0.6
 # Gain, in noise variances, below which another step is not worth its time.
 _TOLERANCE = 1.0
 
@@ -271,28 +269,6 @@ def optimize(
         if cost < best_cost:
             best, best_cost = state, cost
     return best, best_cost
-
-
-@entry
-def descend(
-    data: Array2,
-    start: Array1,
-    first_scale: float,
-    last_scale: float,
-    prior: PriorTerms,
-    noise: float,
-) -> tuple[Array, float]:
-    """Optimize one state as :func:`optimize`, with steps tried before they are taken.
-
-    It takes ten times as long and comes through where pose and motion are hard to tell apart.
-    """
-    state, scale, iterations = start, first_scale, _FIRST_STEPS
-    while scale > last_scale:
-        state, _, _, _ = refine(data, state, (scale, 1.0), prior, noise, 1, iterations, _TOLERANCE)
-        scale, iterations = _RATIO * scale, _STEPS
-    loss = last_scale, 1.0
-    state, _, _, _ = refine(data, state, loss, prior, noise, 1, _FIRST_STEPS, _TOLERANCE)
-    return state, truncated_cost(data, state, last_scale, np.inf)
 
 
 class Candidate(NamedTuple):
@@ -463,18 +439,14 @@ class MotionSearch:
         """Find the motion that most points agree on, from the solver's hypotheses."""
         if not start.found:
             return start
-        observations, threshold = observed.observations, self._config.inlier_threshold
+        observations = observed.observations
+        near, first = observations.within(start.state, self._near), NOTHING
         if self._optimizes:
-            near, state, cost, agreeing = _from_start(
-                observations.packed, observations.count, start.state, self._near, threshold,
-                observed.terms, self._noise,
-            )  # fmt: skip
             # The global-shutter pose is a hypothesis, too: at rest it is the best one.
-            first = Candidate(state, cost)
-            if agreeing < _AGREEING * np.count_nonzero(near):
+            first = self.optimize(observed, start.state, self._near, observed.terms)
+            agreeing = near & observations.within(first.state, self._config.inlier_threshold)
+            if np.count_nonzero(agreeing) < _AGREEING * np.count_nonzero(near):
                 first = self._facing(observed, start, near, first)
-        else:
-            near, first = observations.within(start.state, self._near), NOTHING
         pools = pools_of(
             observations.camera, observations.tau, len(observations.mounts.axes),
             self._solver.sample_size, near, observed.ranking, True,
@@ -493,15 +465,12 @@ class MotionSearch:
         leans by tens of degrees; from there the way leads to other leans, and samples of six noisy
         points tell leaning from moving no better.
         """
-        observations = observed.observations
-        leans, towards = leaning_less(observations.points, near, start.state, 1.0)
-        if not leans:
+        plane, centre, normal = plane_of(observed.observations.points, near)
+        if not plane:
             return found
-        state, cost = descend(
-            observations.packed, towards, self._near, self._config.inlier_threshold,
-            observed.terms, self._noise,
-        )  # fmt: skip
-        return Candidate(state, cost) if cost < found.cost else found
+        towards = leaning_less(start.state, centre, normal, 1.0)
+        other = self.optimize(observed, towards, self._near, observed.terms)
+        return other if other.cost < found.cost else found
 
     def optimize(
         self, observed: Observed, state: Array, first_scale: float, terms: PriorTerms
@@ -512,20 +481,3 @@ class MotionSearch:
             self._config.inlier_threshold, terms, self._noise,
         )  # fmt: skip
         return Candidate(optimized, cost)
-
-
-@entry
-def _from_start(
-    data: Array2, count: int, start: Array1, wide: float, threshold: float, prior: PriorTerms,
-    noise: float,
-) -> tuple[BoolArray, Array, float, int]:  # fmt: skip
-    """Return which points may belong to a motion with this global-shutter pose, and how many agree
-    with it; between them the motion and its cost, by local optimization.
-    """
-    near, agreeing = squared_errors(data, count, start) < wide * wide, 0
-    states = start.copy().reshape(1, STATE_SIZE)
-    state, cost = optimize(states, np.zeros(1), data, wide, threshold, prior, noise)
-    if cost < np.inf:
-        errors = squared_errors(data, count, state)
-        agreeing = int(np.count_nonzero(near & (errors < threshold * threshold)))
-    return near, state, cost, agreeing
