@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writes the first part of ``docs/reasons.md`` from the table that ``replay`` prints from.
+"""Writes the first part of ``docs/reasons.md`` from the names that ``replay`` explains.
 
     python docs/make_reasons.py
 
@@ -10,10 +10,10 @@ What follows there is written by hand, and kept.
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Iterable
 from pathlib import Path
 
-from rs_localizer.pipeline.refusal import IMU_REASONS, REASONS, SETTINGS, Meaning
+from rs_localizer.core.reasons import SETTINGS, ImuReason, Reason
 
 REASONS_PAGE = Path(__file__).with_name("reasons.md")
 _REASONS_INTRODUCTION = """\
@@ -39,15 +39,12 @@ def reasons_page() -> str:
     written = REASONS_PAGE.read_text(encoding="utf-8")
     by_hand = written[written.index(_BY_HAND) :]
     introduction = _REASONS_INTRODUCTION.format(settings=SETTINGS)
-    tables = introduction + _rows(REASONS) + _IMU_INTRODUCTION + _rows(IMU_REASONS)
+    tables = introduction + _rows(Reason) + _IMU_INTRODUCTION + _rows(ImuReason)
     return tables + by_hand
 
 
-def _rows(reasons: Mapping[str, Meaning]) -> str:
-    said = (
-        f"* `{name}`: {means}; *{look.replace(SETTINGS, 'settings')}*"
-        for name, (means, look) in reasons.items()
-    )
+def _rows(reasons: Iterable[Reason | ImuReason]) -> str:
+    said = (f"* `{it}`: {it.means}; *{it.look_at.replace(SETTINGS, 'settings')}*" for it in reasons)
     return "".join(f"{textwrap.fill(line, 100, subsequent_indent='  ')}\n" for line in said)
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.reasons import Reason
 from rs_localizer.io.bags import BagReader, BagWriter
 from rs_localizer.io.image_clock import readout_fault
 from rs_localizer.io.messages import stamp_ns
@@ -44,7 +45,7 @@ from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.imu_readings import ImuState
 from rs_localizer.pipeline.map_to_odom import CorrectionState
 from rs_localizer.pipeline.published import broadcast
-from rs_localizer.pipeline.refusal import Refusal, explained
+from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.settings import NODE_NAME
 from rs_localizer.solvers.table import find_solver
 
@@ -144,7 +145,7 @@ class Tally:
     done: Callable[[], object] = lambda: None  # called after each frame
     track: Track = field(default_factory=Track)
     correction: CorrectionState = field(default_factory=CorrectionState)  # of map -> odom
-    refused: Counter[str] = field(default_factory=Counter)
+    refused: Counter[Reason] = field(default_factory=Counter)
     last_refusal: str = "nothing came"
     not_sent: int = 0
     repeated: int = 0
@@ -326,7 +327,7 @@ def summary(tally: Tally, config: NodeConfig, timed: bool = True) -> list[str]:
         ]
     lines = [f"{name:40} {text!s:>8}" for name, text in rows]
     reasons = (*tally.refused, *(tally.imu.reasons if tally.imu else ()))
-    sentences = {reason: explained(reason) for reason in reasons}
+    sentences: dict[str, str] = {it: f"{it.means}; {it.look_at}" for it in reasons}
     for name, text in (
         sentences | {name: text for name, (_, text) in tally.notices.items()}
     ).items():

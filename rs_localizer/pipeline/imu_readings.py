@@ -23,7 +23,7 @@ from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.status import InertialSettings, InertialStatus, Unused
 from rs_localizer.io.imu import ImuReading
 from rs_localizer.io.transforms import TransformError, Transforms
-from rs_localizer.pipeline.refusal import IMU_REASONS, Notify
+from rs_localizer.pipeline.refusal import Notify
 from rs_localizer.tracking import Tracker
 
 # Readings around the exposure are used, because the spline needs neighbours, and the tracker needs
@@ -45,7 +45,7 @@ _LEAST_RATE = 1e9 / LONGEST_PERIOD_NS
 
 def in_words(unused: Unused) -> str:
     """Describe a reason and what was found."""
-    means = IMU_REASONS[unused.reason].means
+    means = unused.reason.means
     return f"{means}: {unused.detail}" if unused.detail else means
 
 
@@ -57,7 +57,7 @@ class ImuState:
     used: int  # of them
     share: float  # of the last of them
     mostly: Unused | None  # most frequent of the last frames; None: it was used in all
-    reasons: dict[str, int]  # of the others, how many for which
+    reasons: dict[ImuReason, int]  # of the others, how many for which
     rate: float  # Hz; NaN: unknown
     time_offset: float  # s to be added to its stamps, in all; NaN: unknown
     status: InertialStatus | None  # what the frames say of the gyroscope
@@ -82,7 +82,7 @@ class ImuInput:
         self._with_force = 0  # how many
         self._gravity: float | None = None
         self._frames = self._used = 0
-        self._reasons: Counter[str] = Counter()
+        self._reasons: Counter[ImuReason] = Counter()
         self._in_a_row: deque[ImuReason] = deque(maxlen=_LONG)
         self._reported: ImuReason | None = None
         self._odd = 0  # frames in a row that say what the gyroscope has

@@ -13,12 +13,11 @@ import pytest
 
 from rs_localizer.cli.commands import COMMANDS
 from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig
-from rs_localizer.core.reasons import Notice
+from rs_localizer.core.reasons import ImuReason, Notice, Reason
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.topics import LIVE
 from rs_localizer.offline.frame_table import COLUMNS
 from rs_localizer.pipeline.inputs import INPUTS
-from rs_localizer.pipeline.refusal import IMU_REASONS, REASONS
 from rs_localizer.ros.localizer.node import LocalizerNode
 from rs_localizer.ros.node.diagnostics import State
 from rs_localizer.settings import FIRST, Kind, settings
@@ -130,7 +129,7 @@ def test_every_notice_is_explained_and_given_somewhere():
 
 
 def test_the_page_of_symptoms_names_what_exists():
-    known = {*Notice, *REASONS, *IMU_REASONS, *settings(), *INPUTS, "replay"}
+    known = {*Notice, *Reason, *ImuReason, *settings(), *INPUTS, "replay"}
     said = pages.names_in(pages.prose("docs/wrong_poses.md"))
     names = {name for name in said if re.fullmatch(r"[a-z_]+(\.[a-z_]+)?", name)}
     assert names <= known

@@ -17,7 +17,7 @@ from rs_localizer.io.topics import GIVEN_POSES
 from rs_localizer.offline.replay import NO_FRAMES, find_topics
 from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.inputs import INPUTS, Role
-from rs_localizer.pipeline.refusal import REASONS, Refusal
+from rs_localizer.pipeline.refusal import Refusal
 
 ROOT = Path(__file__).parents[2]
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
@@ -53,7 +53,6 @@ def test_a_message_that_cannot_be_read_is_refused_for_a_known_reason(name, tmp_p
     refusal = item.take_message(localizer, broken)
     assert isinstance(refusal, Refusal)
     assert refusal.reason == item.refused
-    assert refusal.reason in REASONS
     assert (refusal.reason in NO_FRAMES) == (item.role != Role.FRAMES)
 
 
@@ -86,8 +85,7 @@ def test_what_is_not_there_or_not_clear_is_said():
 PACKAGE = Path(rs_localizer.__file__).parent
 
 
-def test_every_reason_is_explained_and_given_somewhere():
-    assert set(REASONS) == set(Reason)
+def test_every_reason_is_given_somewhere():
     others = (path for path in PACKAGE.rglob("*.py") if path.name != "reasons.py")
     given = {name for path in others for name in re.findall(r"\bReason\.(\w+)", path.read_text())}
     assert {reason.name for reason in Reason} == given

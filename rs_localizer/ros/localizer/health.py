@@ -16,7 +16,6 @@ from rs_localizer.pipeline.camera_frames import DOUBTFUL
 from rs_localizer.pipeline.imu_readings import ImuState, in_words
 from rs_localizer.pipeline.inputs import Role, input_in_words, input_named
 from rs_localizer.pipeline.map_to_odom import Decision, Standing
-from rs_localizer.pipeline.refusal import IMU_REASONS
 from rs_localizer.ros.node.conversion import make_message
 from rs_localizer.ros.node.diagnostics import (
     Health,
@@ -88,12 +87,12 @@ def imu_oddity(state: ImuState | None) -> dict[str, str]:
         return {}
     oddities = {}
     if state.mostly is not None and state.share < _FEW:
-        look_at = IMU_REASONS[state.mostly.reason].look_at
-        oddities["imu"] = f"the IMU is not used: {in_words(state.mostly)} ({look_at})"
+        mostly, look_at = in_words(state.mostly), state.mostly.reason.look_at
+        oddities["imu"] = f"the IMU is not used: {mostly} ({look_at})"
     if state.status is not None and state.status.oddity:
         oddities["imu.gyroscope"] = (
             f"the camera's rotation says of the gyroscope: {state.status.oddity} "
-            f"({IMU_REASONS[ImuReason.DISAGREES].look_at})"
+            f"({ImuReason.DISAGREES.look_at})"
         )
     if state.gravity is not None and state.gravity > _MOST_TILT:
         oddities["imu.gravity"] = (
