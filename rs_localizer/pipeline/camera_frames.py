@@ -29,7 +29,7 @@ from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline import what_fits
 from rs_localizer.pipeline.cloud_checks import stale_landmarks
 from rs_localizer.pipeline.frames import FrameLocalizer, is_timed
-from rs_localizer.pipeline.imu_readings import inertial_settings
+from rs_localizer.pipeline.imu_readings import Moment, inertial_settings
 from rs_localizer.pipeline.pose_at_time import middle_row_ns, published_moment
 from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
 from rs_localizer.tracking import FrameContext, Tracker
@@ -82,8 +82,11 @@ class CameraFrames(FrameLocalizer):
 
     def awaits_imu(self, stamp_ns: int, patience: float) -> bool:
         """Return True if readings of the frame with this stamp may come within so many seconds."""
-        time_ns = self._middle_row_ns(stamp_ns)
-        return self.imu.awaits(self._tracker, self._config, time_ns, patience)
+        return self.imu.awaits(self._moment(self._middle_row_ns(stamp_ns)), patience)
+
+    def _moment(self, time_ns: int) -> Moment:
+        """Return what readings of the IMU at a time are for."""
+        return Moment(self._tracker, self._config, time_ns, self.camera_frame, self.transforms)
 
     def localize(self, message: Any) -> Localized | Refusal | None:
         """Localize one sensor_msgs/PointCloud2 of correspondences; never raises for bad ones."""
@@ -143,7 +146,6 @@ class CameraFrames(FrameLocalizer):
     def _localize(self, cloud: Correspondences) -> Localized | Refusal:
         if not self.calibrations:
             return Refusal(Reason.NO_CAMERA_INFO, "no usable camera_info has come yet")
-        config, frame = self._config, self.camera_frame
         cloud = self._checked(cloud)
         time_ns, context = self._middle_row_ns(cloud.stamp_ns), self._context
         self._expect(time_ns, cloud.frame)
@@ -152,12 +154,12 @@ class CameraFrames(FrameLocalizer):
             matches = cloud.points, cloud.pixels, cloud.scores
             return self._tracker.localize(time_ns, *matches, imu=samples, context=context)
 
-        self.imu.track(self._tracker, config, time_ns, frame, self.transforms, localized)
+        self.imu.track(self._moment(time_ns), localized)
         result = self._tracker.newest
         assert result is not None
         if result:
             ahead = (cloud.points[result.inliers] - result.position) @ result.rotation[2]
-            self._stream.pace(time_ns, result, float(np.median(ahead)), config)
+            self._stream.pace(time_ns, result, float(np.median(ahead)), self._config)
             self._pose_prior.judge_result(result)
             if self.predicts:
                 self._newest = replace(cloud, table=cloud.table[:0], dropped=0)
@@ -262,8 +264,7 @@ class CameraFrames(FrameLocalizer):
             return None
         newest_ns, samples = self._tracker.newest_ns, None
         if newest_ns is not None and stamp_ns > newest_ns:
-            known = self._tracker, self._config, stamp_ns, self.camera_frame, self.transforms
-            samples = self.imu.ahead(*known)
+            samples = self.imu.ahead(self._moment(stamp_ns))
         found = self._tracker.at(stamp_ns, samples)
         if found is None:
             return None

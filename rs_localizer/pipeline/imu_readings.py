@@ -11,6 +11,7 @@ import math
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -64,6 +65,24 @@ class ImuState:
     # rad, between gravity as the accelerometer shows it and gravity_in_map; NaN: not known yet;
     # None: imu.gravity is off
     gravity: float | None = None
+
+
+class Moment(NamedTuple):
+    """A time, and what readings of that time are for."""
+
+    tracker: Tracker
+    config: NodeConfig
+    time_ns: int  # by the camera's clock; of a frame, of its middle row
+    camera_frame: str  # the camera's axes
+    transforms: Transforms  # how the IMU is turned against them
+
+    def exposure(self) -> tuple[int, int]:
+        """Return the times of first and last row by the clock of the IMU, as far as it is known."""
+        status = self.tracker.inertial
+        estimated = 0.0 if status is None or math.isnan(status.time_offset) else status.time_offset
+        middle_ns = self.time_ns - round(1e9 * (self.config.imu.time_offset + estimated))
+        half_ns = round(0.5e9 * self.config.readout_time)
+        return middle_ns - half_ns, middle_ns + half_ns
 
 
 class ImuInput:
@@ -121,61 +140,30 @@ class ImuInput:
             self._gravity,
         )
 
-    def awaits(self, tracker: Tracker, config: NodeConfig, time_ns: int, patience: float) -> bool:
+    def awaits(self, frame: Moment, patience: float) -> bool:
         """Return True if missing readings of this exposure may come within so many seconds."""
-        if not self._wanted(config) or tracker.inertial is None:
+        if not self._wanted(frame.config) or frame.tracker.inertial is None:
             return False
-        _, end_ns = _exposure(config, time_ns, tracker)
-        missing_ns = self._buffer.lag(end_ns + _AROUND_NS)
+        missing_ns = self._buffer.lag(frame.exposure()[1] + _AROUND_NS)
         return 0 < missing_ns <= round((patience + _BUNDLE) * 1e9)
 
-    def ahead(
-        self,
-        tracker: Tracker,
-        config: NodeConfig,
-        time_ns: int,
-        camera_frame: str,
-        transforms: Transforms,
-    ) -> ImuSamples | None:
+    def ahead(self, now: Moment) -> ImuSamples | None:
         """Return the readings from the last frame until this time.
 
         None where there are none, or the frame was the last one so long ago that none counts.
         """
-        if not self._wanted(config) or tracker.inertial is None:
+        if not self._wanted(now.config) or now.tracker.inertial is None:
             return None
-        start_ns, _ = _exposure(config, time_ns - round(1e9 * config.max_prediction), tracker)
-        readings = self._buffer.between(
-            start_ns, start_ns, start_ns - _BEFORE_NS, time_ns + _AROUND_NS
-        )
-        if isinstance(readings, Unused):
-            return None
-        times_ns = readings.stamps_ns + round(1e9 * config.imu.time_offset)
-        try:
-            return in_camera_axes(
-                readings, times_ns, transforms, (camera_frame, self.frame), time_ns
-            )
-        except TransformError:
-            return None
+        since_ns = now.time_ns - round(1e9 * now.config.max_prediction)
+        start_ns, _ = now._replace(time_ns=since_ns).exposure()
+        samples = self._samples(now, start_ns, start_ns, now.time_ns + _AROUND_NS)
+        return None if isinstance(samples, Unused) else samples
 
     def track(
-        self,
-        tracker: Tracker,
-        config: NodeConfig,
-        time_ns: int,
-        camera_frame: str,
-        transforms: Transforms,
-        localized: Callable[[ImuSamples | None], Estimate | Failure],
+        self, frame: Moment, localized: Callable[[ImuSamples | None], Estimate | Failure]
     ) -> Estimate | Failure:
-        """Localize the frame whose middle row was exposed at ``time_ns``, with its readings.
-
-        Args:
-            tracker: that localizes.
-            config: the settings.
-            time_ns: by the camera's clock.
-            camera_frame: the camera's axes.
-            transforms: how the IMU is turned against them.
-            localized: the frame by the tracker, with samples or with the camera alone.
-        """
+        """Localize a frame by the tracker, with its samples or with the camera alone."""
+        config, tracker = frame.config, frame.tracker
         if not self._wanted(config):
             return localized(None)
         if tracker.inertial is None:
@@ -183,7 +171,7 @@ class ImuInput:
             reason = ImuReason.NO_READOUT_TIME if unknown else ImuReason.NOT_TRACKING
             self._count(config, None, Unused(reason))
             return localized(None)
-        samples = self._samples(tracker, config, time_ns, camera_frame, transforms)
+        samples = self._samples_of(frame)
         if isinstance(samples, Unused):
             result = localized(None)
             self._count(config, tracker, samples)
@@ -213,29 +201,27 @@ class ImuInput:
     def _wanted(self, config: NodeConfig) -> bool:
         return config.imu.use != ImuUse.NONE and self.frame != ""
 
+    def _samples_of(self, frame: Moment) -> ImuSamples | Unused:
+        start_ns, end_ns = frame.exposure()
+        samples = self._samples(frame, start_ns, end_ns, end_ns + _AROUND_NS)
+        late = isinstance(samples, Unused) and samples.reason is ImuReason.LATE
+        if late and self._buffer.rate() < _LEAST_RATE:  # why they are late, and what is to be said
+            return Unused(ImuReason.TOO_SLOW, f"{self._buffer.rate():.0f} Hz")
+        return samples
+
     def _samples(
-        self,
-        tracker: Tracker,
-        config: NodeConfig,
-        time_ns: int,
-        camera_frame: str,
-        transforms: Transforms,
+        self, at: Moment, start_ns: int, end_ns: int, until_ns: int
     ) -> ImuSamples | Unused:
-        start_ns, end_ns = _exposure(config, time_ns, tracker)
-        readings = self._buffer.between(
-            start_ns, end_ns, start_ns - _BEFORE_NS, end_ns + _AROUND_NS
-        )
+        """Return readings that cover a span, and those before and after it."""
+        readings = self._buffer.between(start_ns, end_ns, start_ns - _BEFORE_NS, until_ns)
         if isinstance(readings, Unused):
-            slow = readings.reason is ImuReason.LATE and self._buffer.rate() < _LEAST_RATE
-            if slow:  # which is why they are late, and what is to be said of them
-                return Unused(ImuReason.TOO_SLOW, f"{self._buffer.rate():.0f} Hz")
             return readings
-        times_ns = readings.stamps_ns + round(1e9 * config.imu.time_offset)
+        times_ns = readings.stamps_ns + round(1e9 * at.config.imu.time_offset)
         try:
-            frames = camera_frame, self.frame
-            return in_camera_axes(readings, times_ns, transforms, frames, time_ns)
+            frames = at.camera_frame, self.frame
+            return in_camera_axes(readings, times_ns, at.transforms, frames, at.time_ns)
         except TransformError as error:
-            text = f"from the IMU {self.frame!r} to the camera {camera_frame!r}: {error}"
+            text = f"from the IMU {self.frame!r} to the camera {at.camera_frame!r}: {error}"
             return Unused(ImuReason.NO_TRANSFORM, text)
 
     def _count(self, config: NodeConfig, tracker: Tracker | None, unused: Unused | None) -> None:
@@ -272,15 +258,6 @@ def inertial_settings(config: NodeConfig) -> InertialSettings | None:
         or (_GIVEN_OFFSET if config.imu.time_offset else _ANY_OFFSET),
         gravity_in_map=np.array(config.gravity_in_map, float) if config.imu.gravity else None,
     )
-
-
-def _exposure(config: NodeConfig, time_ns: int, tracker: Tracker) -> tuple[int, int]:
-    """Return the times of first and last row by the clock of the IMU, as far as it is known."""
-    status = tracker.inertial
-    estimated = 0.0 if status is None or math.isnan(status.time_offset) else status.time_offset
-    middle_ns = time_ns - round(1e9 * (config.imu.time_offset + estimated))
-    half_ns = round(0.5e9 * config.readout_time)
-    return middle_ns - half_ns, middle_ns + half_ns
 
 
 def in_camera_axes(
