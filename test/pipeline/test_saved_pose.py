@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.io.transforms import Transform
-from rs_localizer.pipeline.saved_pose import load_pose, save_pose
+from rs_localizer.pipeline.given_pose import load_pose, save_pose
 
 POSE = Transform(Rotation.from_euler("zyx", [0.7, 0.1, -0.2]).as_matrix(), np.array([3.0, 4, 0.2]))
 

@@ -21,10 +21,9 @@ from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import LIVE, MAP_TO_ODOM
 from rs_localizer.io.transforms import NotYetError, TransformError, make_transform
 from rs_localizer.pipeline.carried_pose import Click, FoundPose, Odometry
-from rs_localizer.pipeline.given_pose import GivenPose
+from rs_localizer.pipeline.given_pose import PERIOD, GivenPose, load_pose, save_pose
 from rs_localizer.pipeline.map_to_odom import CorrectionState, Decision, Settings, Standing, decide
 from rs_localizer.pipeline.published import Broadcast, broadcast, pose_in_odometry
-from rs_localizer.pipeline.saved_pose import PERIOD, load_pose, save_pose
 from rs_localizer.ros.localizer.rivals import Rivals
 from rs_localizer.ros.localizer.tf import Tf, import_tf2_ros, needed
 from rs_localizer.ros.node.conversion import make_message, message_class, steady_timer
