@@ -138,7 +138,6 @@ setup(
             "marker_detector = rs_localizer.ros.main:marker_detector",
             "feature_detector = rs_localizer.ros.main:feature_detector",
             "doctor = rs_localizer.ros.main:doctor",
-            "example_matcher = rs_localizer.ros.main:example_matcher",
             "rs_localizer = rs_localizer.__main__:run",
         ],
     },

@@ -116,7 +116,6 @@ def test_declared_commands_can_be_imported(wheel):
         "localizer",
         "marker_detector",
         "feature_detector",
-        "example_matcher",
         "rs_localizer",
     }
     for name, value in declared["console_scripts"].items():

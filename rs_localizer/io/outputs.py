@@ -90,6 +90,19 @@ def _sent(covariance: Array) -> Array:
     return known.ravel()
 
 
+def make_pose(pose: BodyPose, make: Make) -> Any:
+    """Return the geometry_msgs/Pose of a pose."""
+    position = make_vector(make, pose.position, "Point")
+    orientation = make_quaternion(make, pose.rotation)
+    return make("geometry_msgs/msg/Pose", position=position, orientation=orientation)
+
+
+def make_pose_with_covariance(pose: BodyPose, make: Make, made: Any = None) -> Any:
+    """Return the geometry_msgs/PoseWithCovariance of a pose, whose message may be made already."""
+    kind, covariance = "geometry_msgs/msg/PoseWithCovariance", _sent(pose.covariance)
+    return make(kind, pose=made or make_pose(pose, make), covariance=covariance)
+
+
 def messages(frame: Localized, make: Make) -> dict[str, Any]:
     """Return the messages of a frame by topic (:data:`TYPES`), for node and replay alike.
 
@@ -113,17 +126,11 @@ def each_message(
 
     @cache
     def pose() -> Any:
-        return make(
-            "geometry_msgs/msg/Pose",
-            position=make_vector(make, frame.pose.position, "Point"),
-            orientation=make_quaternion(make, frame.pose.rotation),
-        )
+        return make_pose(frame.pose, make)
 
     @cache
     def pose_with_covariance() -> Any:
-        covariance = _sent(frame.pose.covariance)
-        kind = "geometry_msgs/msg/PoseWithCovariance"
-        return make(kind, pose=pose(), covariance=covariance)
+        return make_pose_with_covariance(frame.pose, make, pose())
 
     @cache
     def velocity() -> Any:

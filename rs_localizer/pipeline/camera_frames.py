@@ -187,9 +187,7 @@ class CameraFrames(FrameLocalizer):
             return
         if self._tracker.prediction(time_ns) is not None:
             return
-        prior = self._pose_prior.prior(
-            time_ns, map_frame, self.camera_frame, self._config, self.transforms
-        )
+        prior = self._pose_prior.prior(self._moment(time_ns), map_frame)
         if prior is not None:
             self._tracker.expect(time_ns, prior)
 

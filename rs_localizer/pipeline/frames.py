@@ -82,7 +82,7 @@ class FrameLocalizer(ABC):
     afresh.
 
     Args:
-        config: settings; assigning :attr:`config` changes them from the next frame on.
+        config: settings; :meth:`change` takes others.
         notice: called with oddities that are no refusal.
         transforms: where the cameras are on ``base_frame``; asked once a frame, so that a mounting
             may change and move. Without it there is none.
@@ -123,10 +123,6 @@ class FrameLocalizer(ABC):
     @property
     def config(self) -> NodeConfig:
         return self._config
-
-    @config.setter
-    def config(self, config: NodeConfig) -> None:
-        self.change(config)
 
     def change(self, config: NodeConfig) -> bool:
         """Use these settings from the next frame on; whether they start the track afresh.

@@ -23,7 +23,8 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.messages import MessageError, stamp_ns
-from rs_localizer.io.transforms import Transform, TransformError, Transforms, from_numbers
+from rs_localizer.io.transforms import Transform, TransformError, from_numbers
+from rs_localizer.pipeline.imu_readings import Moment
 from rs_localizer.pipeline.refusal import Notify
 
 # Deviations (m, rad) that a variance of zero stands for: RViz leaves z, roll and pitch at zero.
@@ -145,21 +146,14 @@ class PosePrior:
     def take_pose(self, given: GivenPose) -> None:
         self.given = given
 
-    def prior(
-        self,
-        time_ns: int,
-        map_frame: str,
-        camera_frame: str,
-        config: NodeConfig,
-        transforms: Transforms,
-    ) -> Prior | None:
+    def prior(self, at: Moment, map_frame: str) -> Prior | None:
         """Return the prior of the camera's motion at a time; None if no pose was given."""
         self._expected = None
         given = self.given
         if given is None:
             return None
-        seconds = abs(time_ns - given.stamp_ns) * 1e-9 if given.stamp_ns else 0.0
-        body = given.body or config.base_frame or camera_frame
+        seconds = abs(at.time_ns - given.stamp_ns) * 1e-9 if given.stamp_ns else 0.0
+        body = given.body or at.config.base_frame or at.camera_frame
         try:
             if given.frame != map_frame:
                 raise TransformError(f"it is in {given.frame!r}, the points are in {map_frame!r}")
@@ -167,14 +161,14 @@ class PosePrior:
                 raise TransformError(f"it is {seconds:.0f} s older, or newer, than the frame")
             body_from_camera = (
                 Transform(np.eye(3), np.zeros(3))
-                if body == camera_frame
-                else transforms.lookup(body, camera_frame, None)
+                if body == at.camera_frame
+                else at.transforms.lookup(body, at.camera_frame, None)
             )
         except TransformError as error:
             self._notice(Notice.PRIOR_REFUSED, f"the given pose is not used: {error}")
             self.given = None
             return None
-        self._expected = _of_camera(given, body_from_camera, seconds, config)
+        self._expected = _of_camera(given, body_from_camera, seconds, at.config)
         return self._expected
 
     def judge_result(self, result: Estimate) -> None:

@@ -196,10 +196,21 @@ class Broadcast:
     parent_from_child: Transform
 
 
-def check_time(frame: Localized) -> None:
+def _check_time(frame: Localized) -> None:
     """Raise ``TransformError`` for a frame that says nothing of its time."""
     if frame.input_stamp_ns == 0:
         raise TransformError("header.stamp of the input is zero: the pose has no time for TF")
+
+
+def pose_transform(frame: Localized) -> Broadcast:
+    """Return the transform that is a frame's pose.
+
+    Raises:
+        TransformError: when the frame says nothing of its time.
+    """
+    _check_time(frame)
+    map_from_body = Transform(frame.pose.rotation, frame.pose.position)
+    return Broadcast(frame.stamp_ns, frame.map_frame, frame.body_frame, map_from_body)
 
 
 def pose_in_odometry(frame: Localized, config: NodeConfig, transforms: Transforms) -> FoundPose:
@@ -208,7 +219,7 @@ def pose_in_odometry(frame: Localized, config: NodeConfig, transforms: Transform
     Raises:
         TransformError: when the frame says nothing of its time, or odometry says nothing for it.
     """
-    check_time(frame)
+    _check_time(frame)
     odom_from_body = transforms.lookup(config.odom_frame, frame.body_frame, frame.stamp_ns)
     at = Odometry(frame.stamp_ns, odom_from_body)
     map_from_body = Transform(frame.pose.rotation, frame.pose.position)
@@ -225,14 +236,11 @@ def broadcast(
     """
     if config.publish_tf == PublishTf.NONE:
         return None, state
-    if config.publish_tf == PublishTf.MAP_TO_ODOM:
-        pose = pose_in_odometry(frame, config, transforms)
-        decision = decide(Settings(config.two_d_mode, config.hold), state, pose)
-        if (correction := decision.map_from_odom) is None:
-            return None, decision.state
-        ahead_ns = frame.stamp_ns + round(config.transform_tolerance * 1e9)
-        sent = Broadcast(ahead_ns, frame.map_frame, config.odom_frame, correction)
-        return sent, decision.state
-    check_time(frame)
-    map_from_body = Transform(frame.pose.rotation, frame.pose.position)
-    return Broadcast(frame.stamp_ns, frame.map_frame, frame.body_frame, map_from_body), state
+    if config.publish_tf == PublishTf.MAP_TO_CAMERA:
+        return pose_transform(frame), state
+    pose = pose_in_odometry(frame, config, transforms)
+    decision = decide(Settings(config.two_d_mode, config.hold), state, pose)
+    if (correction := decision.map_from_odom) is None:
+        return None, decision.state
+    ahead_ns = frame.stamp_ns + round(config.transform_tolerance * 1e9)
+    return Broadcast(ahead_ns, frame.map_frame, config.odom_frame, correction), decision.state

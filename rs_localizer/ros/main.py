@@ -40,11 +40,6 @@ _PROGRAMS = {
         "",
         "What a localizer finds on a running robot, and what is wrong; writes its parameters.",
     ),
-    "example_matcher": (
-        "example_matcher.run",
-        "",
-        "Matches of the bundled webcam recording; prints the poses of a localizer.",
-    ),
 }
 
 
@@ -115,4 +110,3 @@ main = partial(_run, "localizer")
 marker_detector = partial(_run, "marker_detector")
 feature_detector = partial(_run, "feature_detector")
 doctor = partial(_run, "doctor")
-example_matcher = partial(_run, "example_matcher")

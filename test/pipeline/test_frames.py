@@ -216,7 +216,7 @@ def test_refinement_turns_off_what_knows_more_than_the_points_of_a_frame(make_ca
     frames.calibrate(read_camera_info(make_camera_info()))
 
     def told(config: NodeConfig) -> list[Localized]:
-        frames.config = config
+        frames.change(config)
         frames.reset()
         return [localized(frames.localize(message_of(seen))) for seen in simulated()[:2]]
 

@@ -185,7 +185,7 @@ def test_what_changes_starts_afresh(change):
     if change == "reset":
         frames.reset()
     elif change == "settings":
-        frames.config = changed(frames.config, seed=1)
+        frames.change(changed(frames.config, seed=1))
     elif change == "camera":
         frames.calibrate(changed(CALIBRATION, width=641))
     else:

@@ -13,7 +13,6 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.timer import Timer
 from sensor_msgs.msg import CompressedImage, PointCloud2
 from sensor_msgs.msg import Image as ImageMessage
 
@@ -85,7 +84,6 @@ class ImageNode(ManagedNode[Settings, Result], Generic[Settings, Result]):
     ) -> None:
         self._finder: Any = None  # from configuring on the worker's
         self._outputs: tuple[Any, ...] = ()  # publishers of clouds and of debug pictures
-        self._timer: Timer | None = None
         self._listening: tuple[str, ...] = ()
         super().__init__(name, kind, tell, **options)
 
@@ -117,38 +115,28 @@ class ImageNode(ManagedNode[Settings, Result], Generic[Settings, Result]):
         self.make_finder(config)
 
     def open(self, config: Settings) -> None:
-        self._finder = self.make_finder(config)
+        self.use_finder(self.make_finder(config))
         self._outputs = (
             create_output(self, PointCloud2, self.output),
             create_output(self, ImageMessage, f"~/{topics.DEBUG_IMAGE}"),
         )
-        self._description = self.describe(self._finder)
         self.employ(lambda _, image: self._finder.take(image), self._publish)
 
-    def close(self) -> None:
-        for publisher in self._outputs:
-            self.destroy_lifecycle_publisher(publisher)
-        self._outputs = ()
+    def use_finder(self, finder: Any) -> None:
+        """Look at the next images with this one."""
+        self._finder = finder
 
     def begin(self, config: Settings) -> None:
-        self._timer = steady_timer(self, _LOOK_PERIOD, self._look)
-        self.get_logger().info(
-            f"active with {self._description}; subscribed to images while somebody subscribes to "
-            f"{' or '.join(each.topic_name for each in self._outputs)}"
-        )
-
-    def end(self) -> None:
         self._listening = ()
-        if self._timer is not None:
-            self.destroy_timer(self._timer)
-            self._timer = None
+        self.active.callback(self.destroy_timer, steady_timer(self, _LOOK_PERIOD, self._look))
+        self.get_logger().info(
+            f"active with {self.describe(self._finder)}; subscribed to images while somebody "
+            f"subscribes to {' or '.join(each.topic_name for each in self._outputs)}"
+        )
 
     def change(self, config: Settings) -> None:
         if self.worker is not None:
-            self.worker.update("settings", lambda: self._change(config))
-
-    def _change(self, config: Settings) -> None:
-        self._finder = self.make_finder(config)
+            self.worker.update("settings", lambda: self.use_finder(self.make_finder(config)))
 
     def _publish(self, result: Result) -> None:
         """Publish of an image what somebody listens to, in the worker's thread."""

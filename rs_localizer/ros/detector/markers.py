@@ -49,7 +49,6 @@ class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):
     checked_at_start = False  # the map may come later: on_configure tells
 
     def __init__(self, **options: Any) -> None:
-        self._map_view: MapView | None = None
         super().__init__(DETECTOR_NAME, DetectorConfig, tell, **options)
 
     def check(self, config: DetectorConfig) -> None:
@@ -61,23 +60,13 @@ class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):
         return FrameDetector(config, self.refusals.notice)
 
     def open(self, config: DetectorConfig) -> None:
-        super().open(config)
         self._map_view = MapView(self)
-        self._show_map(self.make_finder(config))
+        super().open(config)
 
-    def close(self) -> None:
-        super().close()
-        if self._map_view is not None:
-            self._map_view.close()
-            self._map_view = None
-
-    def change(self, config: DetectorConfig) -> None:
-        super().change(config)
-        self._show_map(self.make_finder(config))
-
-    def _show_map(self, finder: FrameDetector) -> None:
+    def use_finder(self, finder: FrameDetector) -> None:
+        super().use_finder(finder)
         corners = [marker.corners for marker, _ in finder.map.all_markers()]
-        if self._map_view is not None and corners:
+        if corners:
             self._map_view.show(finder.map.map_frame, np.array(corners))
 
     def make_cloud(self, detected: Detected, make: Make) -> Any:

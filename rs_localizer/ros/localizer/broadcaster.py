@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """TF's side of the outputs: sends transforms, and hears who else does."""
 
-import functools
+import contextlib
+import math
 import threading
 import time
 from collections import deque
@@ -16,14 +17,14 @@ from rclpy.node import Node
 from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.atomic_files import OutputError
-from rs_localizer.io.messages import make_header, make_quaternion, make_vector
-from rs_localizer.io.outputs import Localized
+from rs_localizer.io.messages import make_header
+from rs_localizer.io.outputs import BodyPose, Localized, make_pose_with_covariance
 from rs_localizer.io.topics import LIVE, MAP_TO_ODOM
-from rs_localizer.io.transforms import NotYetError, TransformError, make_transform
+from rs_localizer.io.transforms import NotYetError, Transform, TransformError, make_transform
 from rs_localizer.pipeline.carried_pose import Click, FoundPose, Odometry
 from rs_localizer.pipeline.given_pose import PERIOD, GivenPose, load_pose, save_pose
 from rs_localizer.pipeline.map_to_odom import CorrectionState, Decision, Settings, Standing, decide
-from rs_localizer.pipeline.published import Broadcast, broadcast, pose_in_odometry
+from rs_localizer.pipeline.published import Broadcast, pose_in_odometry, pose_transform
 from rs_localizer.ros.localizer.rivals import Rivals
 from rs_localizer.ros.localizer.tf import Tf, import_tf2_ros, needed
 from rs_localizer.ros.node.conversion import make_message, message_class, steady_timer
@@ -54,25 +55,23 @@ class Broadcaster:
 
     def __init__(self, node: Node, refusals: Refusals) -> None:
         self.tf = Tf(node, self._hear)
-        self._node = node
-        self._refusals = refusals
+        self._node, self._refusals, self._config = node, refusals, NodeConfig()
         self._broadcaster: Any = None
         self._publisher: Any = None  # of ~/map_to_odom
         self._timer: Any = None
-        self._config: NodeConfig | None = None
         self._rivals = Rivals()
         self._sending = threading.Lock()  # of the next ones
         # Calls that wait for odometry, and the time.monotonic() at which each is given up.
         self._pending: deque[tuple[Callable[[bool], None], float]] = deque(maxlen=_MOST_PENDING)
         self._state, self._map_frame = CorrectionState(), ""
-        self._decision: Decision | None = None
+        self.decision: Decision | None = None
+        """The last one on ``map -> odom``; None: there has been none."""
         self._sent_ns = 0  # the newest stamp of map -> odom
         self._body = ""  # frame of the body whose correction is held
         self._answer = ""  # to the last given pose
         self._saved: GivenPose | None = None  # of a file; taken when odometry has come
-        self._save_at = 0.0  # time.monotonic()
-        self._sent = 0.0  # when, likewise
-        self._failed: tuple[float, str] | None = None
+        self._save_at = self._sent = 0.0  # time.monotonic()
+        self._failed = -math.inf, ""  # when, likewise, and why
 
     def configure(self, config: NodeConfig) -> None:
         """Create what these settings need.
@@ -84,15 +83,20 @@ class Broadcaster:
         if config.publish_tf != PublishTf.NONE and self._broadcaster is None:
             self._broadcaster = import_tf2_ros(needed(config)).TransformBroadcaster(self._node)
         self._stop_timer()
-        corrects = config.publish_tf == PublishTf.MAP_TO_ODOM
-        if corrects and self._publisher is None:
+        self._config, self._body = config, self._body or config.base_frame
+        if not self._corrects:
+            return
+        if self._publisher is None:
             kind = message_class(LIVE[MAP_TO_ODOM])
             self._publisher = self._node.create_publisher(kind, f"~/{MAP_TO_ODOM}", 10)
             if config.saved_pose_file:
                 self._saved = load_pose(Path(config.saved_pose_file))
-        self._config, self._body = config, self._body or config.base_frame
-        if corrects and config.tf_rate > 0.0:
+        if config.tf_rate > 0.0:
             self._timer = steady_timer(self._node, 1.0 / config.tf_rate, self._tick)
+
+    @property
+    def _corrects(self) -> bool:
+        return self._config.publish_tf == PublishTf.MAP_TO_ODOM
 
     def _stop_timer(self) -> None:
         if self._timer is not None:
@@ -105,7 +109,7 @@ class Broadcaster:
             self._save()
             self._pending.clear()
             self._forget_pose()
-            self._failed, self._answer = None, ""
+            self._failed, self._answer = (-math.inf, ""), ""
 
     def jumped(self, seconds: float) -> None:
         """Forget odometry after a jump of time: it was of another drive."""
@@ -117,26 +121,19 @@ class Broadcaster:
 
     def _forget_pose(self) -> None:
         """Forget the held pose; the drift stays, as odometry is the same."""
-        self._state, self._decision = CorrectionState(drift=self._state.drift), None
+        self._state, self.decision = CorrectionState(drift=self._state.drift), None
 
     def fault(self) -> dict[str, str]:
         """Say for the diagnostics why nothing has been sent lately that should have been."""
-        failed, since = self._failed, time.monotonic() - WINDOW
-        missing = failed is not None and failed[0] >= since and self._sent < since
-        found = {Notice.NOT_BROADCAST: failed[1]} if failed and missing else {}
-        return found | self._rivals.static
-
-    @property
-    def decision(self) -> Decision | None:
-        """The last one on ``map -> odom``; None: there has been none."""
-        return self._decision
+        (when, text), since = self._failed, time.monotonic() - WINDOW
+        missing = when >= since > self._sent
+        return ({Notice.NOT_BROADCAST: text} if missing else {}) | self._rivals.static
 
     @property
     def values(self) -> dict[str, str]:
         """For the diagnostics, by readable names."""
-        decision = self._decision
         values = {"Last given pose": self._answer} if self._answer else {}
-        if decision is None:
+        if (decision := self.decision) is None:
             return values
         values |= {"map -> odom": str(decision.standing), "Correction of odometry": str(decision)}
         if decision.smallest is not None:
@@ -149,35 +146,34 @@ class Broadcaster:
         self.forget()
         self._stop_timer()
         self.tf.close()
-        if self._broadcaster is not None:
-            self._node.destroy_publisher(self._broadcaster.pub_tf)
-            self._broadcaster = None
-        if self._publisher is not None:
-            self._node.destroy_publisher(self._publisher)
-            self._publisher = None
+        for publisher in (self._broadcaster and self._broadcaster.pub_tf, self._publisher):
+            if publisher is not None:
+                self._node.destroy_publisher(publisher)
+        self._broadcaster = self._publisher = None
 
-    def publish(self, frame: Localized, config: NodeConfig) -> None:
+    def publish(self, frame: Localized) -> None:
         """Send the frame's transform: now, or when odometry has come so far.
 
         After ``transform_tolerance`` it is given up.
         """
-        if config.publish_tf != PublishTf.NONE:
-            self._await(functools.partial(self._take, frame, config), config)
+        if self._corrects:
+            self._await(lambda last: self._take(frame))
+        elif self._config.publish_tf != PublishTf.NONE:
+            self._await(lambda last: self._send(pose_transform(frame)))
 
     def give(self, given: GivenPose) -> None:
         """Take a pose that a user gives, for ``map_to_odom``."""
-        config = self._config
-        if config is not None and config.publish_tf == PublishTf.MAP_TO_ODOM:
-            self._await(functools.partial(self._click, given, config), config)
+        if self._corrects:
+            self._await(lambda last: self._click(given, last))
 
-    def _await(self, take: Callable[[bool], None], config: NodeConfig) -> None:
+    def _await(self, take: Callable[[bool], None]) -> None:
         with self._sending:
-            self._pending.append((take, time.monotonic() + config.transform_tolerance))
+            self._pending.append((take, time.monotonic() + self._config.transform_tolerance))
         self._flush()
 
     def _hear(self, transforms: list[Any], static: bool) -> None:
         for item in transforms:
-            for notice, text in self._rivals.hear(item, self._decision, static=static).items():
+            for notice, text in self._rivals.hear(item, self.decision, static=static).items():
                 self._refusals.notice(notice, text)
         self._flush()
 
@@ -195,105 +191,85 @@ class Broadcaster:
                     else:
                         self._say(error)
 
-    def _take(self, frame: Localized, config: NodeConfig, last: bool) -> None:
-        """Send the transform that follows from a frame."""
-        if config.publish_tf != PublishTf.MAP_TO_ODOM:
-            item, _ = broadcast(frame, config, self.tf, self._state)
-            if item is not None:
-                self._send(item)
-            return
-        pose = pose_in_odometry(frame, config, self.tf)
+    def _take(self, frame: Localized) -> None:
+        """Correct odometry by a frame's pose."""
+        pose = pose_in_odometry(frame, self._config, self.tf)
         if frame.map_frame != self._map_frame:
             self._forget_pose()
             self._map_frame = frame.map_frame
-        decision = self._begin(pose, config)
+        decision = self._begin(pose)
         if decision.said:
             self._refusals.notice(Notice.MAP_JUMPED, decision.said)
         if decision.standing is Standing.CONTRADICTED:
             self._refusals.notice(Notice.CONTRADICTED, str(decision))
         self._body = frame.body_frame
-        self._hold(config)
+        self._hold()
 
-    def _click(self, given: GivenPose, config: NodeConfig, last: bool) -> None:
+    def _click(self, given: GivenPose, last: bool) -> None:
         """Take a given pose, and answer."""
-        body, frame = given.body or self._body, given.frame
+        config, body, frame = self._config, given.body or self._body, given.frame
         if not body:
             text = "refused: set base_frame, of which it is the pose"
         elif frame in (config.odom_frame, body) or self._map_frame not in ("", frame):
-            text = (
-                f"refused: it is in {frame!r}, the map is {self._map_frame or config.map_frame!r}"
-            )
+            known = self._map_frame or config.map_frame
+            text = f"refused: it is in {frame!r}, the map is {known!r}"
         else:
-            text = self._clicked(given, body, config, last)
+            text = self._clicked(given, body, last)
         self._answer = f"{text} ({time.strftime('%H:%M:%S')})"
         self._refusals.notice(Notice.POSE_GIVEN, text)
 
-    def _clicked(self, given: GivenPose, body: str, config: NodeConfig, last: bool) -> str:
-        late = ""
+    def _clicked(self, given: GivenPose, body: str, last: bool) -> str:
+        late, stamp, odom_frame = "", given.stamp_ns or None, self._config.odom_frame
         try:
-            stamp = given.stamp_ns or None
-            odom = self.tf.lookup(config.odom_frame, body, stamp)
+            odom = self.tf.lookup(odom_frame, body, stamp)
         except TransformError as error:
             if isinstance(error, NotYetError) and not last:
                 raise
-            late = f"; odometry does not know its time: {error}"
-            stamp = None
-        newest_ns, newest = self.tf.latest(config.odom_frame, body)
+            late, stamp = f"; odometry does not know its time: {error}", None
         if stamp is None:
-            odom, stamp = newest, newest_ns or self._now_ns
+            stamp, odom = self._newest(body)
         self._body, self._map_frame = body, given.frame
-        at = Odometry(stamp, odom)
-        text = self._begin(Click(at, given.pose, given.allowed), config).said
-        self._hold(config)
-        return text + late
+        said = self._begin(Click(Odometry(stamp, odom), given.pose, given.allowed)).said
+        self._hold()
+        return said + late
 
-    def _begin(self, seen: FoundPose, config: NodeConfig) -> Decision:
+    def _newest(self, body: str) -> tuple[int, Transform]:
+        """Return the stamp of the newest odometry, and it; of now if it is static."""
+        stamp_ns, odom = self.tf.latest(self._config.odom_frame, body)
+        return stamp_ns or self._node.get_clock().now().nanoseconds, odom
+
+    def _begin(self, seen: FoundPose) -> Decision:
         """Decide, and send the first transform at once."""
         first = self._state.held is None
-        decision = self._decide(seen, config)
+        decision = self._decide(seen)
         if first:  # nobody shall have to wait for the time that it is stamped ahead
             self._sent_ns = 0
-            self._send_correction(seen.at.stamp_ns, config)
+            self._send_correction(seen.at.stamp_ns)
         return decision
 
-    @property
-    def _now_ns(self) -> int:
-        now_ns: int = self._node.get_clock().now().nanoseconds
-        return now_ns
-
-    def _decide(self, seen: Odometry | FoundPose, config: NodeConfig) -> Decision:
-        decision = decide(Settings(config.two_d_mode, config.hold), self._state, seen)
-        self._state, self._decision = decision.state, decision
+    def _decide(self, seen: Odometry | FoundPose) -> Decision:
+        settings = Settings(self._config.two_d_mode, self._config.hold)
+        self.decision = decision = decide(settings, self._state, seen)
+        self._state = decision.state
         return decision
 
     def _tick(self) -> None:
-        config = self._config
-        if config is None or config.publish_tf != PublishTf.MAP_TO_ODOM:
-            return
         with self._sending:
+            if self._saved is not None and self._state.held is None and self._body:
+                with contextlib.suppress(TransformError):  # odometry has not come yet
+                    self._click(self._saved, True)
+                    self._saved = None
             try:
-                if self._saved is not None and self._state.held is None and self._body:
-                    saved, self._saved = self._saved, None
-                    self._await_saved(saved, config)
-                self._hold(config)
+                self._hold()
             except TransformError as error:
                 self._say(error)
             if time.monotonic() >= self._save_at:
                 self._save()
 
-    def _await_saved(self, saved: GivenPose, config: NodeConfig) -> None:
-        try:
-            self.tf.latest(config.odom_frame, self._body)
-        except TransformError:  # odometry has not come yet
-            self._saved = saved
-        else:
-            self._click(saved, config, True)
-
     def _save(self) -> None:
         """Keep the pose in the file that the settings name."""
         self._save_at = time.monotonic() + PERIOD
-        file = "" if self._config is None else self._config.saved_pose_file
-        decision, newest = self._decision, self._state.newest
+        file, decision, newest = self._config.saved_pose_file, self.decision, self._state.newest
         if not file or decision is None or newest is None or decision.map_from_odom is None:
             return
         if decision.standing is Standing.CONTRADICTED or decision.covariance is None:
@@ -304,43 +280,33 @@ class Broadcaster:
         except OutputError as error:
             self._refusals.notice(Notice.NOT_BROADCAST, f"saved_pose_file: {error}")
 
-    def _hold(self, config: NodeConfig) -> None:
+    def _hold(self) -> None:
         """Send the held transform, stamped ahead of the newest odometry, if that is new."""
         if self._state.held is None:
             return
-        newest_ns, odom = self.tf.latest(config.odom_frame, self._body)
-        newest_ns = newest_ns or self._now_ns
-        self._decide(Odometry(newest_ns, odom), config)
-        ahead_ns = newest_ns + round(config.transform_tolerance * 1e9)
+        odometry = Odometry(*self._newest(self._body))
+        self._decide(odometry)
+        ahead_ns = odometry.stamp_ns + round(self._config.transform_tolerance * 1e9)
         if ahead_ns < self._sent_ns - _RESTART:
             self._sent_ns = 0
         if ahead_ns > self._sent_ns:
-            self._send_correction(ahead_ns, config)
+            self._send_correction(ahead_ns)
 
-    def _send_correction(self, stamp_ns: int, config: NodeConfig) -> None:
-        decision = self._decision
+    def _send_correction(self, stamp_ns: int) -> None:
+        decision = self.decision
         if decision is None or (correction := decision.map_from_odom) is None:
             return
-        self._send(Broadcast(stamp_ns, self._map_frame, config.odom_frame, correction))
+        self._send(Broadcast(stamp_ns, self._map_frame, self._config.odom_frame, correction))
         self._sent_ns = stamp_ns
         if self._publisher is not None and self._publisher.get_subscription_count():
             assert decision.of_transform is not None
-            pose = make_message(
-                "geometry_msgs/msg/Pose",
-                position=make_vector(make_message, correction.translation, "Point"),
-                orientation=make_quaternion(make_message, correction.rotation),
-            )
-            spread = {"pose": pose, "covariance": decision.of_transform.ravel()}
-            self._publisher.publish(
-                make_message(
-                    LIVE[MAP_TO_ODOM],
-                    header=make_header(make_message, stamp_ns, self._map_frame),
-                    pose=make_message("geometry_msgs/msg/PoseWithCovariance", **spread),
-                )
-            )
+            pose = BodyPose(correction.translation, correction.rotation, decision.of_transform)
+            made = make_pose_with_covariance(pose, make_message)
+            header = make_header(make_message, stamp_ns, self._map_frame)
+            self._publisher.publish(make_message(LIVE[MAP_TO_ODOM], header=header, pose=made))
 
     def _say(self, error: TransformError) -> None:
-        text = f"publish_tf {'' if self._config is None else self._config.publish_tf}: {error}"
+        text = f"publish_tf {self._config.publish_tf}: {error}"
         self._failed = time.monotonic(), text
         self._refusals.notice(Notice.NOT_BROADCAST, text)
 

@@ -103,7 +103,7 @@ class Publisher:
         self._motion = camera.snapshot() if camera is not None and ticks else None
         self._send(frame, [INLIERS] if ticks else TYPES)
         if not ticks or config.publish_tf == PublishTf.MAP_TO_ODOM:
-            self._broadcaster.publish(frame, config)
+            self._broadcaster.publish(frame)
         self._map_view.show(frame.map_frame, frames.map_points)
         if camera is not None and self._wanted(CAMERA_MARKER):
             marker = MarkerArray(markers=[camera_marker(frame, camera.view_corners)])
@@ -122,16 +122,11 @@ class Publisher:
         self._newest_ns = now_ns
         self._send(frame, _MOTION)
         if config.publish_tf == PublishTf.MAP_TO_CAMERA:
-            self._broadcaster.publish(frame, config)
+            self._broadcaster.publish(frame)
 
     def forget(self) -> None:
         """Publish nothing of the frames so far."""
         self._motion = None
-
-    def close(self) -> None:
-        self._map_view.close()
-        for publisher in self._publishers.values():
-            self._node.destroy_lifecycle_publisher(publisher)
 
     def _wanted(self, name: str) -> bool:
         return bool(self._publishers[name].get_subscription_count())
@@ -152,7 +147,6 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         self._frames: FrameLocalizer | None = None  # the worker's: here only to be read
         self._publisher: Publisher | None = None
         self._ticks: Timer | None = None  # of output_rate
-        self._service: Any = None
         self._needs_tf = True  # of readings whose axes are not the camera's
         super().__init__(NODE_NAME, NodeConfig, tell, **options)
         self._broadcaster = Broadcaster(self, self.refusals)
@@ -165,10 +159,14 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         frames = frame_localizer(config, self.refusals.notice, self._broadcaster.tf)
         frames.load_files()
         self._say_map(frames)
+        self.opened.callback(self._broadcaster.close)
         self._broadcaster.configure(config)
         self._frames, self._needs_tf = frames, True
         self._publisher = Publisher(self, frames, self._broadcaster)
-        self._service = self.create_service(Trigger, "~/reset", self._reset)
+        self.opened.callback(
+            self.destroy_service, self.create_service(Trigger, "~/reset", self._reset)
+        )
+        self.opened.callback(self._drop)
         named = inputs_of(config)
 
         def localize(topic: str, message: Any) -> Results:
@@ -176,15 +174,12 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
 
         self.employ(localize, self._publisher.publish, functools.partial(_patience, frames))
 
-    def close(self) -> None:
-        self._frames = None
-        self._broadcaster.close()
-        if self._publisher is not None:
-            self._publisher.close()
-            self.destroy_service(self._service)
-            self._publisher = None
+    def _drop(self) -> None:
+        self._frames = self._publisher = None
 
     def begin(self, config: NodeConfig) -> None:
+        self.active.callback(self._forget)
+        self.active.callback(self._tick_at, 0.0)
         topics = self.listen(self.topics(config))
         if config.readout_time == 0.0 and not config.of_cameras:
             self.warn(
@@ -194,10 +189,6 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
             f"active with solver {config.solver}, listening to {' and '.join(topics)}"
         )
         self._tick_at(config.output_rate)
-
-    def end(self) -> None:
-        self._tick_at(0.0)
-        self._forget()
 
     def change(self, config: NodeConfig) -> None:
         if self._frames is not None:
@@ -210,7 +201,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         """Publish the motion at this rate (Hz); 0: with the images only."""
         if self._ticks is not None:
             self.destroy_timer(self._ticks)
-            self._ticks = None
+        self._ticks = None
         if rate > 0.0 and self._publisher is not None:
             self._ticks = steady_timer(self, 1.0 / rate, self._publisher.publish_motion)
 

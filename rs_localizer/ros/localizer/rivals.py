@@ -4,15 +4,15 @@
 
 import threading
 from collections import OrderedDict
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from rs_localizer.core import so3
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.transforms import Transform, TransformError, read_transform
-from rs_localizer.pipeline.carried_pose import far
+from rs_localizer.pipeline.carried_pose import PLACE, TURN, far
 from rs_localizer.pipeline.map_to_odom import Decision
 from rs_localizer.pipeline.published import Broadcast
 
@@ -84,11 +84,14 @@ class Rivals:
             return other if static else ""
         if not static and stamp_ns(message) <= (self._first_ns or 0):
             return ""  # of the node before its restart
-        off, spread = _offset(ours, theirs, decision), decision.covariance
-        assert spread is not None
-        allowed = [np.sqrt(spread[part, part].trace()) for part in _PARTS]
-        lengths = [np.linalg.norm(off[part]) for part in _PARTS]
-        if not static and all(np.array(lengths) <= np.multiply(_DEVIATIONS, allowed)):
+        held, now, spread = decision.state.held, decision.state.newest, decision.covariance
+        assert held and now and spread is not None  # noqa: PT018 - or nothing is sent
+        off = held.pose.offset(replace(held.pose, map_from_odom=theirs), now)
+        within = (
+            np.linalg.norm(off[part]) <= _DEVIATIONS * np.sqrt(spread[part, part].trace())
+            for part in (PLACE, TURN)
+        )
+        if not static and all(within):
             return ""
         return f"{other}: {_said(theirs)} instead of {_said(ours)}, which moves the body {far(off)}"
 
@@ -104,18 +107,6 @@ class Rivals:
         if parent != before and not (static and fixed != parent):
             return ""
         return f"TF frame {child!r} has two parents, {last!r} and {parent!r}"
-
-
-_PARTS = (slice(0, 3), slice(3, 6))
-
-
-def _offset(ours: Transform, theirs: Transform, decision: Decision) -> Any:
-    """Return the offset (6,) m, rad from our pose of the body to theirs."""
-    newest = decision.state.newest
-    odom = Transform(np.eye(3), np.zeros(3)) if newest is None else newest.odom_from_body
-    here, there = ours @ odom, theirs @ odom
-    turn = so3.log(np.ascontiguousarray(there.rotation @ here.rotation.T))
-    return np.concatenate([there.translation - here.translation, turn])
 
 
 def _said(transform: Transform) -> str:

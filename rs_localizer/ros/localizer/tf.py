@@ -96,10 +96,18 @@ class Tf:
     def _listen(self, tf2_ros: Any) -> None:
         if self._buffer is not None:
             return
-        buffer = tf2_ros.Buffer()
-        self._errors, self._buffer = tf2_ros, buffer
-        listener = _listen(tf2_ros, buffer, self._node, self._hear)
-        self._undo.callback(listener.unregister)
+        self._errors, self._buffer, hear = tf2_ros, tf2_ros.Buffer(), self._hear
+
+        class Listener(tf2_ros.TransformListener):  # type: ignore[misc]
+            def callback(self, data: Any) -> None:
+                super().callback(data)
+                hear(data.transforms, False)
+
+            def static_callback(self, data: Any) -> None:
+                super().static_callback(data)
+                hear(data.transforms, True)
+
+        self._undo.callback(Listener(self._buffer, self._node).unregister)
 
     def _hear(self, transforms: list[Any], static: bool) -> None:
         for item in transforms:
@@ -151,36 +159,15 @@ class Tf:
             raise TransformError(f"there are no transforms of the time {stamp_ns * 1e-9:.3f} s")
         try:
             return buffer.lookup_transform(target, source, Time(nanoseconds=stamp_ns or 0))
-        except self._errors.ExtrapolationException as error:
-            text = _text(error)
         except self._errors.TransformException as error:
-            raise TransformError(self._unusable.explain(_text(error))) from error
-        latest_ns = None
+            text = " ".join(str(error).split())
+            if not isinstance(error, self._errors.ExtrapolationException):
+                raise TransformError(self._unusable.explain(text)) from error
         with contextlib.suppress(self._errors.TransformException):
             latest_ns = stamp_of(buffer.lookup_transform(target, source, Time()))
-        if stamp_ns is not None and latest_ns is not None:
-            if latest_ns < stamp_ns:
+            if stamp_ns is not None and latest_ns < stamp_ns:
                 raise NotYetError(text)
-            if latest_ns - stamp_ns > _MEMORY:
+            if stamp_ns is not None and latest_ns - stamp_ns > _MEMORY:
                 # A recording that starts over: tf2 would ignore all that comes from now on.
                 buffer.clear()
         raise TransformError(text)
-
-
-def _listen(tf2_ros: Any, buffer: Any, node: Node, hear: Callable[[list[Any], bool], None]) -> Any:
-    """Return a tf2_ros.TransformListener that passes on what has come."""
-
-    class Listener(tf2_ros.TransformListener):  # type: ignore[misc]
-        def callback(self, data: Any) -> None:
-            super().callback(data)
-            hear(data.transforms, False)
-
-        def static_callback(self, data: Any) -> None:
-            super().static_callback(data)
-            hear(data.transforms, True)
-
-    return Listener(buffer, node)
-
-
-def _text(error: Exception) -> str:
-    return " ".join(str(error).split())

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 from rclpy.clock import Clock, ClockType
-from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.timer import Timer
+
+_OUTPUT = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
 
 @cache
@@ -69,11 +70,15 @@ def xyz(vector: Any) -> Any:
     return np.array([vector.x, vector.y, vector.z])
 
 
-def create_output(node: LifecycleNode, kind: type, topic: str, *, overridable: bool = False) -> Any:
-    """Create a reliable publisher for an active node; its QoS may have parameters."""
+def create_output(node: Any, kind: type, topic: str, *, overridable: bool = False) -> Any:
+    """Create a reliable publisher of an active :class:`.ManagedNode`, until it is cleaned up.
+
+    Its QoS may have parameters.
+    """
     options = QoSOverridingOptions.with_default_policies() if overridable else None
-    profile = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-    return node.create_lifecycle_publisher(kind, topic, profile, qos_overriding_options=options)
+    made = node.create_lifecycle_publisher(kind, topic, _OUTPUT, qos_overriding_options=options)
+    node.opened.callback(node.destroy_lifecycle_publisher, made)
+    return made
 
 
 def steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:

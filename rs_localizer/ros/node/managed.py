@@ -22,13 +22,13 @@ import rclpy
 from lifecycle_msgs.srv import ChangeState
 from rclpy.context import Context
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
 
 from rs_localizer.process.stopping import StopRequest
-from rs_localizer.ros.node import parameters
 from rs_localizer.ros.node.bond import Bond
 from rs_localizer.ros.node.diagnostics import Diagnostics, Health
+from rs_localizer.ros.node.parameters import SettingsNode
 from rs_localizer.ros.node.refusals import Refusals, describe
 from rs_localizer.ros.node.statistics import Statistics, Told
 from rs_localizer.ros.node.subscriptions import Inputs, Silence, Topic
@@ -38,55 +38,35 @@ from rs_localizer.settings import Config
 Result = TypeVar("Result")
 
 
-class ManagedNode(parameters.Started, LifecycleNode, Generic[Config, Result]):
+class ManagedNode(SettingsNode[Config], Generic[Config, Result]):
     """Only while active it takes and publishes messages.
 
-    A node defines its work by overriding :meth:`check`, :meth:`open`, :meth:`close`, :meth:`begin`,
-    :meth:`end`, :meth:`change` and :meth:`examine`.
+    A node defines its work by overriding :meth:`check`, :meth:`open`, :meth:`begin`,
+    :meth:`change` and :meth:`examine`.
 
     Args:
-        name: of the node.
-        kind: class of its settings, which become its parameters.
+        name, kind, options: as of :class:`.SettingsNode`.
         tell: returns the stamp (ns) and the statistics of a result.
-        options: of rclpy's node.
-
-    Raises:
-        ValueError: when it is started with parameters that are refused, saying what was found.
     """
 
     task: ClassVar[str]  # in the name of the diagnosis
     lack: ClassVar[str]  # the notice of what it waits for
-    checked_at_start: ClassVar[bool] = True
 
     def __init__(
         self,
         name: str,
-        kind: type[Config],
+        kind: Any,  # class of its settings, which mypy cannot follow to the base class
         tell: Callable[[Result], tuple[int, Told]],
         **options: Any,
     ) -> None:
-        super().__init__(name, **options)
-        self._kind: type[Config] = kind
-        self.state = "unconfigured"
-        """Label of the state in which the last transition has ended."""
-        # It exists from configuring to cleaning up.
-        self.worker: Worker[Result] | None = None
-        # It exists from activating to deactivating.
+        self.worker: Worker[Result] | None = None  # from configuring to cleaning up
         self._inputs: Inputs | None = None
-        self._bond: Bond | None = None
-        try:
-            config = parameters.declare(self, kind)
-            if self.checked_at_start:
-                self.check(config)
-        except ValueError:
-            super().destroy_node()  # of Kilted on, the context would end what was never made
-            raise
-        for text in parameters.unknown_names(self, kind):
-            self.warn(f"a parameter is ignored: {text}")
-        parameters.on_change(
-            self, kind, check=self.check, apply=self.change, state=lambda: self.state
-        )
-        self.autostart: bool = config.autostart
+        self.opened = contextlib.ExitStack()
+        """What is undone when the node is cleaned up."""
+        self.active = contextlib.ExitStack()
+        """What is undone when the node is deactivated."""
+        super().__init__(name, kind, **options)
+        self.autostart: bool = self.config.autostart
         self.refusals = Refusals(self.warn)
         self.statistics: Statistics[Result] = Statistics(
             self.refusals, tell, lambda: int(self.get_clock().now().nanoseconds)
@@ -100,32 +80,16 @@ class ManagedNode(parameters.Started, LifecycleNode, Generic[Config, Result]):
 
     # -- what a node does --------------------------------------------------------------------
 
-    def check(self, config: Config) -> None:
-        """Raise ``ValueError`` for settings that cannot be used."""
-        raise NotImplementedError
-
     def open(self, config: Config) -> None:
-        """Make what lives until :meth:`close`, the worker by :meth:`employ`.
+        """Make what lives as long as :attr:`opened`, the worker by :meth:`employ`.
 
         Raises:
             ValueError: when it cannot be configured so, saying why.
         """
         raise NotImplementedError
 
-    def close(self) -> None:
-        """Undo :meth:`open`, also where it failed half-way, or has not been called."""
-        raise NotImplementedError
-
     def begin(self, config: Config) -> None:
         """Listen and say so: the node is active."""
-        raise NotImplementedError
-
-    def end(self) -> None:
-        """Undo :meth:`begin`, except for the subscriptions."""
-        raise NotImplementedError
-
-    def change(self, config: Config) -> None:
-        """Take settings that were accepted while the node runs."""
         raise NotImplementedError
 
     def examine(self) -> tuple[Health, str]:
@@ -133,12 +97,6 @@ class ManagedNode(parameters.Started, LifecycleNode, Generic[Config, Result]):
         raise NotImplementedError
 
     # -- what it has for that ----------------------------------------------------------------
-
-    @property
-    def config(self) -> Config:
-        """The settings as the parameters are now."""
-        config: Config = parameters.read(self, self._kind)
-        return config
 
     @property
     def silence(self) -> dict[str, Silence]:
@@ -160,13 +118,8 @@ class ManagedNode(parameters.Started, LifecycleNode, Generic[Config, Result]):
         """Listen to these topics instead of those so far; their full names."""
         if self._inputs is not None:
             self._inputs.close()
-            self._inputs = None
-        if topics:
-            self._inputs = Inputs(self, topics, self.refusals)
+        self._inputs = Inputs(self, topics, self.refusals) if topics else None
         return [] if self._inputs is None else self._inputs.topics
-
-    def warn(self, text: str) -> None:
-        self.get_logger().warning(text)
 
     # -- life cycle --------------------------------------------------------------------------
 
@@ -223,24 +176,21 @@ class ManagedNode(parameters.Started, LifecycleNode, Generic[Config, Result]):
         return self._arrived("unconfigured", super().on_cleanup(state))
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._end()
         self._close()
         return self._arrived("finalized", super().on_shutdown(state))
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._end()
         self._close()
         return self._arrived("unconfigured", super().on_error(state))
 
     def destroy_node(self) -> None:
-        self._end()
         self._close()
         super().destroy_node()
 
     def _bind(self) -> None:
         """Tell nav2's lifecycle manager that the node lives, where its messages are installed."""
         try:
-            self._bond = Bond(self)
+            self.active.callback(Bond(self).close)
         except (ImportError, AttributeError):  # not there, or another package of this name
             self.get_logger().info(
                 "nav2's lifecycle manager gets no heartbeat, and needs bond_timeout 0.0: the "
@@ -249,19 +199,17 @@ class ManagedNode(parameters.Started, LifecycleNode, Generic[Config, Result]):
             )
 
     def _end(self) -> None:
-        if self._bond is not None:
-            self._bond.close()
-            self._bond = None
         self.listen({})
         if self.worker is not None:
             self.worker.pause()
-        self.end()
+        self.active.close()
 
     def _close(self) -> None:
+        self._end()
         if self.worker is not None:
             self.worker.close()
             self.worker = None
-        self.close()
+        self.opened.close()
 
 
 # A waiting executor does not see signals: it looks up this often, in s.

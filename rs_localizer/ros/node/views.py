@@ -3,11 +3,10 @@
 """Views for RViz and Foxglove beside the messages of a frame: the map, and the camera in it."""
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from geometry_msgs.msg import Point
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray  # type: ignore[import-untyped]
@@ -30,13 +29,13 @@ class MapView:
     """Publishes a map on ``~/map_markers``, also for late subscribers.
 
     Args:
-        node: creates the publisher.
+        node: a :class:`.ManagedNode`, which publishes it until it is cleaned up.
     """
 
-    def __init__(self, node: Node) -> None:
-        self._node = node
+    def __init__(self, node: Any) -> None:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._publisher = node.create_publisher(MarkerArray, f"~/{MAP_MARKERS}", latched)
+        node.opened.callback(node.destroy_publisher, self._publisher)
         self._shown: Array | None = None
 
     def show(self, frame: str, points: Array | None) -> None:
@@ -44,9 +43,6 @@ class MapView:
         if points is not None and points is not self._shown:
             self._shown = points
             self._publisher.publish(MarkerArray(markers=[map_marker(frame, points)]))
-
-    def close(self) -> None:
-        self._node.destroy_publisher(self._publisher)
 
 
 def map_marker(frame: str, points: Array) -> Marker:

@@ -133,13 +133,13 @@ def test_a_transform_without_a_rotation_is_named(made, robot, peer, turn):
 def test_the_correction_never_stops(made, robot, peer):
     node = made(publish_tf="map_to_odom", transform_tolerance=0.2, hold=3.0)
     assert not node.notes
-    node.publish(frame(5_000_000_000), node.config)
+    node.publish(frame(5_000_000_000))
     assert node.notes[0][0] == "not_broadcast"
     assert "does not exist" in node.notes.pop()[1]
     for tenth in range(50, 61):
         robot.send("odom", "base_link", 0.1 * tenth, tenth * 10**8, NO_TURN)
     known(node, peer, "odom", "base_link", 6 * 10**9)
-    node.publish(frame(5_500_000_000, x=5.5), node.config)
+    node.publish(frame(5_500_000_000, x=5.5))
     # No frame comes any more, odometry does.
     for tenth in range(61, 80):
         robot.send("odom", "base_link", 0.1 * tenth, tenth * 10**8, NO_TURN)
@@ -150,7 +150,7 @@ def test_the_correction_never_stops(made, robot, peer):
     assert str(node.broadcaster.decision).startswith("holding for 2.4 s, ")
     assert node.broadcaster.values["map -> odom"] == "held"
     # A frame that contradicts it beyond all drift is kept aside, and room is made for it.
-    node.publish(frame(7_800_000_000, x=97.8), node.config)
+    node.publish(frame(7_800_000_000, x=97.8))
     decision = node.broadcaster.decision
     assert decision.map_from_odom.translation[0] == pytest.approx(0.0)
     assert decision.covariance[0, 0] > 80.0**2
@@ -190,7 +190,7 @@ def test_others_wait_until_what_is_being_sent_is_out(made, peer, robot, monkeypa
         send(item)
 
     monkeypatch.setattr(broadcaster, "sendTransform", sending)
-    node.publish(frame(5_500_000_000, x=5.5), node.config)
+    node.publish(frame(5_500_000_000, x=5.5))
     assert waited[:1] == [True]
 
 
@@ -255,7 +255,7 @@ def test_the_last_pose_is_kept_and_started_from(made, robot, peer, tmp_path):
     }  # fmt: skip
     node = made(**settings)
     odometry(node, robot, peer, *range(50, 61))
-    node.publish(frame(5_500_000_000, x=12.0), node.config)
+    node.publish(frame(5_500_000_000, x=12.0))
     node.broadcaster.close()
     saved = json.loads(file.read_text())
     assert saved["position"] == pytest.approx([12.5, 0.0, 0.0])
@@ -277,7 +277,7 @@ def sending(made, robot, peer) -> Any:
     odometry(node, robot, peer, *range(50, 61))
     sure = frame(5_500_000_000, x=5.5)
     sure.pose.covariance[...] *= 1e-4
-    node.publish(sure, node.config)
+    node.publish(sure)
     heard(robot, peer, "map", "odom")
     return node
 

@@ -16,7 +16,7 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.camera_files import lens_parameters
 from rs_localizer.io.rigs import RigParts, mounted_lenses, node_parameters
-from rs_localizer.ros.node import parameters
+from rs_localizer.ros.node.parameters import SettingsNode
 from rs_localizer.settings import settings, write_camera_file
 
 
@@ -28,16 +28,20 @@ def context() -> Iterator[Context]:
     rclpy.shutdown(context=context)
 
 
-class Recorder:
+class Recorder(SettingsNode[NodeConfig]):
     """A node with the parameters, that refuses one seed and keeps what is applied."""
 
     def __init__(self, context: Context, *arguments: str) -> None:
-        self.node = parameters.Started(
-            "some_node", context=context, cli_args=["--ros-args", *arguments]
-        )
-        self.config = parameters.declare(self.node, NodeConfig)
+        words = ["--ros-args", *arguments]
         self.applied: list[NodeConfig] = []
-        parameters.on_change(self.node, NodeConfig, self.check, self.applied.append)
+        self.warnings: list[str] = []
+        super().__init__("some_node", NodeConfig, context=context, cli_args=words)
+
+    def warn(self, text: str) -> None:
+        self.warnings.append(text)
+
+    def change(self, config: NodeConfig) -> None:
+        self.applied.append(config)
 
     def check(self, config: NodeConfig) -> None:
         if config.seed == 13:
@@ -47,7 +51,7 @@ class Recorder:
         changes = [
             Parameter(name.replace("__", "."), value=value) for name, value in values.items()
         ]
-        result = self.node.set_parameters_atomically(changes)
+        result = self.set_parameters_atomically(changes)
         return result.successful, result.reason
 
 
@@ -55,13 +59,13 @@ class Recorder:
 def recorder(context) -> Iterator[Recorder]:
     recorder = Recorder(context)
     yield recorder
-    recorder.node.destroy_node()
+    recorder.destroy_node()
 
 
 def test_every_setting_is_a_parameter_with_its_default(recorder):
     assert recorder.config == NodeConfig()
     for name, setting in settings().items():
-        value = recorder.node.get_parameter(name).value
+        value = recorder.get_parameter(name).value
         assert value == setting.default
         assert type(value) is type(setting.default)
 
@@ -81,7 +85,7 @@ def test_what_is_refused_stays_as_it_was(recorder, change, reason):
     assert not successful
     assert re.search(reason, text)
     assert recorder.applied == []
-    assert parameters.read(recorder.node, NodeConfig) == NodeConfig()
+    assert recorder.config == NodeConfig()
 
 
 @pytest.mark.parametrize(
@@ -114,9 +118,9 @@ def test_a_file_of_a_camera_or_of_a_rig_is_a_params_file_too(context, tmp_path, 
     ):  # fmt: skip
         write_camera_file(file, values, lens)
         made = Recorder(context, *words, "-p", "min_inliers:=11")
-        assert parameters.unknown_names(made.node, NodeConfig) == []
+        assert made.warnings == []
         configs.append(made.config)
-        made.node.destroy_node()
+        made.destroy_node()
     assert (configs[0].readout_time, configs[0].min_inliers) == (0.021, 11)
     assert configs[1].cameras == ("a", "b")
     own = configs[1].of_cameras["b"]
