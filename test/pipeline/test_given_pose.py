@@ -14,6 +14,7 @@ from rs_localizer.io.bags import make_message
 from rs_localizer.io.messages import MessageError, make_header, make_quaternion, make_vector
 from rs_localizer.io.transforms import Transform, TransformTree, make_transform
 from rs_localizer.pipeline.given_pose import PosePrior, read_given_pose
+from rs_localizer.pipeline.imu_readings import Moment
 
 SECOND = 10**9
 CONFIG = NodeConfig(readout_time=0.03, base_frame="base_link")
@@ -42,6 +43,11 @@ def given(
     return SimpleNamespace(**message, **({"child_frame_id": body} if body else {}))
 
 
+def moment(time_ns: int, tree: TransformTree) -> Moment:
+    tracker: Any = None
+    return Moment(tracker, CONFIG, time_ns, "camera", tree)
+
+
 def asked(message: Any, time_ns: int = 5 * SECOND) -> tuple[Any, list[str], PosePrior]:
     notices: list[str] = []
     tree = TransformTree()
@@ -49,7 +55,7 @@ def asked(message: Any, time_ns: int = 5 * SECOND) -> tuple[Any, list[str], Pose
     tree.add(SimpleNamespace(transforms=[stamped]), static=True)
     prior = PosePrior(lambda name, text: notices.append(f"{name}: {text}"))
     prior.take_pose(read_given_pose(message))
-    return prior.prior(time_ns, "map", "camera", CONFIG, tree), notices, prior
+    return prior.prior(moment(time_ns, tree), "map"), notices, prior
 
 
 def test_what_a_click_says_of_the_camera():
@@ -82,7 +88,7 @@ def test_what_cannot_be_used_is_said_once(message, time_ns, text):
     assert found is None
     assert notice.startswith("prior_refused: the given pose is not used: ")
     assert text in notice
-    assert prior.prior(time_ns, "map", "camera", CONFIG, TransformTree()) is None
+    assert prior.prior(moment(time_ns, TransformTree()), "map") is None
 
 
 @pytest.mark.parametrize(("body", "lasts"), [("", False), ("base_link", True)])
