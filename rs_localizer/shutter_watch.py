@@ -176,12 +176,19 @@ class ShutterWatch:
             joint[:MOTION_PARAMETERS, :MOTION_PARAMETERS] += np.outer(step, step)
         return replace(found, joint_covariance=joint)
 
-    def add(self, time_ns: int, found: Estimate | Failure, points: Array, pixels: Array) -> None:
-        """Take a frame whose middle row was exposed at ``time_ns``, as it was localized."""
+    def add(
+        self, time_ns: int, found: Estimate | Failure, points: Array, pixels: Array,
+        *, jumped: bool = False,
+    ) -> None:  # fmt: skip
+        """Take a frame whose middle row was exposed at ``time_ns``, as it was localized.
+
+        ``jumped``: no camera goes there from the last frame. No motion within an image tells of
+        such a way.
+        """
         if not found or self._camera is None or self._may_rest(self._camera.readout_time):
             self._looks.clear()
             return
-        if self._looks and time_ns <= self._looks[-1].time_ns:
+        if jumped or (self._looks and time_ns <= self._looks[-1].time_ns):
             self._looks.clear()
         some = slice(None, None, 1 + len(points) // _MOST_POINTS)
         points, pixels = map(np.ascontiguousarray, (points[some], pixels[some]))

@@ -233,6 +233,22 @@ class Tracker:
         track = self._track
         return track is not None and 0.0 < (time_ns - track.time_ns) * 1e-9 <= _LONGEST_GAP
 
+    def _has_jumped(self, time_ns: int, prior: Prior | None, result: Estimate | Failure) -> bool:
+        """Return whether a frame was found elsewhere than predicted, and farther than cameras go.
+
+        A recording has started over, a robot was moved, or the frames before were wrong.
+        """
+        track, most = self._track, self.localizer.config.velocity_prior
+        if track is None or prior is None or prior.motion is None or not result or result.tracked:
+            return False
+        before, seconds = track.estimate, 1e-9 * (time_ns - track.time_ns)
+        turn = so3.log(np.ascontiguousarray(before.rotation @ result.rotation.T))
+        way = result.position - before.position
+        return any(
+            0.0 < limit * seconds < np.linalg.norm(step)
+            for limit, step in ((most.angular, turn), (most.linear, way))
+        )
+
     def _check_time(self, time_ns: int) -> None:
         """Raise ``ValueError`` for a time that cannot be in nanoseconds."""
         if isinstance(time_ns, bool) or not isinstance(time_ns, (int, np.integer)):
@@ -428,7 +444,9 @@ class Tracker:
             foreseen = self._aid.foresee(imu, time_ns, self._before(time_ns))
         result, prior = self._fitted(time_ns, foreseen, span, context, find)
         if pixels is not None:  # of a camera alone
-            self.shutter.add(time_ns, result, np.asarray(points, float), np.asarray(pixels, float))
+            jumped = self._has_jumped(time_ns, prior, result)
+            seen = np.asarray(points, float), np.asarray(pixels, float)
+            self.shutter.add(time_ns, result, *seen, jumped=jumped)
             self.lens.add(result)
         if result:
             result = self.shutter.widened(self._judged(result, points, pixels, prior))

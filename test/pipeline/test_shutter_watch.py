@@ -53,13 +53,13 @@ START = 600  # frames into the recording, where the hand is on its way
 
 @cache
 def frames_with_truth(
-    direction: str = "top_to_bottom", count: int = FRAMES, start: int = START
+    direction: str = "top_to_bottom", count: int = FRAMES, start: int = START, rate: float = 30.0
 ) -> list[tuple[Any, TrueState]]:
     """Clouds, and where the camera was when their first rows, or columns, were exposed."""
     motion = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
     world = room(sampled_states(motion).positions, np.random.default_rng(0), count=3000)
     first = motion.intervals_ns[0][0]
-    stamps = [first + round((start + k) * 1e9 / 30) for k in range(count)]
+    stamps = [first + round(start * 1e9 / 30 + k * 1e9 / rate) for k in range(count)]
     seen = FrameSettings(points=80, noise=0.5, outliers=0.1)
     messages = []
     camera = changed(CAMERA, scan_direction=direction)
@@ -113,6 +113,19 @@ def test_a_wrong_readout_time_is_said_once(factor, tracking):
     twist = seen.last().twist
     speed = np.concatenate([twist.linear, twist.angular])
     assert np.linalg.solve(twist.covariance, speed) @ speed < (factor * READOUT / error) ** 2
+
+
+def test_a_recording_that_starts_over_with_running_stamps_raises_no_alarm():
+    """The way from its end to its beginning is no motion of the camera."""
+    seen = Watched(40, frames_with_truth(count=40, start=900, rate=100.0), readout_time=READOUT)
+    step_ns = seen.results[-1].input_stamp_ns - seen.results[-2].input_stamp_ns
+    for k, (message, _) in enumerate(frames_with_truth(count=5, start=0, rate=100.0)):
+        stamp_ns = seen.results[-1].input_stamp_ns + (k + 1) * step_ns
+        cloud = changed(read_correspondences(message), stamp_ns=stamp_ns)
+        assert seen.frames.localize_cloud(cloud)
+    assert seen.notices == []
+    assert seen.watch.trusted
+    assert not seen.watch.is_global
 
 
 def test_a_robot_that_drives_slowly_is_hardly_ever_doubted():
