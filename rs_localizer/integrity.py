@@ -28,11 +28,11 @@ from rs_localizer.estimation.prior import Prior
 from rs_localizer.native import entry
 
 NAMES = (
-    "share", "together", "apart", "persists", "spread", "filled", "count", "innovation", "lasting",
+    "share", "together", "apart", "persists", "spread", "filled", "count", "innovation",
 )  # fmt: skip
 """Names of the numbers of a frame."""
 # Of the regression: the constant, then the weights of NAMES; the innovation counts as a jump only.
-WEIGHTS = np.array([1.363, -0.855, 0.011, 0.365, 0.845, -4.351, -0.551, -0.653, 0.0, 0.0])
+WEIGHTS = np.array([1.363, -0.855, 0.011, 0.365, 0.845, -4.351, -0.551, -0.653, 0.0])
 # Weight of a frame's log odds beside those of earlier frames; probabilities per frame that a right
 # track goes wrong and that a wrong one recovers; probabilities that a first pose is wrong in either
 # way. A right scene in the middle of the image, with a fifth of its matches wrong, reaches 0.02
@@ -157,7 +157,7 @@ class Integrity:
     def numbers(
         self, estimate: Estimate, points: ArrayLike, pixels: ArrayLike, prior: Prior | None
     ) -> Array:
-        """Return the numbers (9,) of the next frame, in the order of ``NAMES``.
+        """Return the numbers (8,) of the next frame, in the order of ``NAMES``.
 
         Args:
             estimate: of the frame.
@@ -184,7 +184,6 @@ class Integrity:
                 filled,
                 math.log(max(inliers - 6.0, 1.0)),
                 0.0 if prior is None else _innovation(estimate, prior),
-                persists * outliers,  # of few, as of landmarks that are gone, less
             ]
         )
 

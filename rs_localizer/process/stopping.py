@@ -6,9 +6,11 @@ Imports nothing that takes time, so that a program can begin with it.
 """
 
 import contextlib
+import faulthandler
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from types import FrameType
@@ -157,3 +159,21 @@ def _is_handled(error: BaseException | None) -> bool:
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
+
+
+@contextlib.contextmanager
+def ends_within(seconds: float, code: int) -> Iterator[None]:
+    """End the process with this exit code if what is done within takes longer (s), and say so."""
+
+    def leave() -> None:
+        sys.stderr.write(f"the process did not end within {seconds:g} s, and stands here:\n")
+        faulthandler.dump_traceback(all_threads=True)
+        os._exit(code)
+
+    timer = threading.Timer(seconds, leave)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()

@@ -7,15 +7,13 @@ and publishes diagnostics; the worker's does the work and publishes its results.
 """
 
 import contextlib
-import faulthandler
 import functools
 import gc
 import os
 import sys
-import threading
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Generic, TypeVar
 
 import rclpy
@@ -25,7 +23,7 @@ from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedE
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
 
-from rs_localizer.process.stopping import StopRequest
+from rs_localizer.process.stopping import StopRequest, ends_within
 from rs_localizer.ros.node.bond import Bond
 from rs_localizer.ros.node.diagnostics import Diagnostics, Health
 from rs_localizer.ros.node.parameters import SettingsNode
@@ -250,7 +248,7 @@ def run(
     try:
         code = _start(node, stop) or spin(node, lambda: stop.requested)
     finally:
-        with _ends_within(_LONGEST_END, code):
+        with ends_within(_LONGEST_END, code):
             node.destroy_node()
             rclpy.try_shutdown()
     if not wait_for_workers(_LAST_FRAME_TIMEOUT):
@@ -259,24 +257,6 @@ def run(
         sys.stderr.flush()
         os._exit(code)
     return code
-
-
-@contextlib.contextmanager
-def _ends_within(seconds: float, code: int) -> Iterator[None]:
-    """End the process with this exit code if the middleware holds its end up, and say so."""
-
-    def leave() -> None:
-        sys.stderr.write(f"the node did not end within {seconds:g} s, and stands here:\n")
-        faulthandler.dump_traceback(all_threads=True)
-        os._exit(code)
-
-    timer = threading.Timer(seconds, leave)
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
 
 
 def _start(node: Any, stop: StopRequest) -> int:

@@ -30,11 +30,6 @@ _LATE_PERIOD = 0.005
 _MOST_LATE = 100
 
 
-def _nothing(message: Any) -> float:
-    """Return the time that a frame waits: none."""
-    return 0.0
-
-
 @dataclass(frozen=True, slots=True)
 class _Arrival:
     """A frame that has come."""
@@ -67,7 +62,7 @@ class Worker(Generic[Result]):
         publish: Callable[[Result], None],
         statistics: Statistics[Result],
         failed: Callable[[str], None],
-        patience: Callable[[Any], float] = _nothing,
+        patience: Callable[[Any], float] = lambda _: 0.0,
     ) -> None:
         self._work, self._publish, self._patience = work, publish, patience
         self._statistics, self._failed = statistics, failed
@@ -138,32 +133,26 @@ class Worker(Generic[Result]):
 
     def _take(self) -> bool:
         """Wait for something to do, apply updates and take a frame; False at the end."""
-        timeout = 0.0 if self._is_ready() else None
-        if timeout is None and (self._late or self._early):
-            timeout = _LATE_PERIOD
+        waits = self._late or self._early
+        timeout = 0.0 if self._is_ready() else _LATE_PERIOD if waits else None
         with self._changed:
             self._changed.wait_for(
                 lambda: self._updates or self._frames or self._closed or self._woken, timeout
             )
             self._woken = False
             updates, self._updates = self._updates, {}
-            oldest = next(iter(self._frames), None)
-            if oldest is not None:
+            if oldest := next(iter(self._frames), None):
                 self._early.append(self._frames.pop(oldest))
         for update in updates.values():
-            try:
-                update()
-            except Exception as error:  # of one message: the others go on
-                self._failed(describe(error))
+            if isinstance(failure := self._attempt(update), Refusal):
+                self._failed(failure.detail)
         return not self._closed
 
     def _is_ready(self) -> bool:
         """Return True if there is a frame that need not wait."""
-        if not self._early:
-            return False
+        if not self._early or len(self._early) > _MOST_LATE:
+            return bool(self._early)
         frame = self._early[0]
-        if len(self._early) > _MOST_LATE:
-            return True
         patience = self._attempt(lambda: self._patience(frame.message)) or 0.0
         return time.monotonic() >= frame.received + patience
 
@@ -176,18 +165,14 @@ class Worker(Generic[Result]):
             self._statistics.dropped(1)
             return
         self._statistics.started()
-        for each in self._results(frame):
+        result = self._attempt(lambda: self._work(frame.topic, frame.message))
+        several = result if isinstance(result, Iterator) else iter([result])
+        while (each := self._attempt(lambda: next(several, None))) is not None:
             if isinstance(each, Waiting) and len(self._late) < _MOST_LATE:
                 self._late.append((frame, each, time.monotonic() + each.patience))
             else:
                 self._finish(frame, each)
         self._statistics.ended()
-
-    def _results(self, frame: _Arrival) -> Iterator[Any]:
-        result = self._attempt(lambda: self._work(frame.topic, frame.message))
-        several = result if isinstance(result, Iterator) else iter([result])
-        while (each := self._attempt(lambda: next(several, None))) is not None:
-            yield each
 
     def _finish_late(self) -> None:
         """Publish results that are ready, in the order of their arrival; give up overdue ones."""
