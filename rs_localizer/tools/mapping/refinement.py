@@ -35,7 +35,7 @@ from rs_localizer.tools.adjust.variables import (
     Unknowns,
     rig_state,
 )
-from rs_localizer.tools.mapping.gauge import as_held, generators, laid_over
+from rs_localizer.tools.mapping.gauge import Similarity, as_held, generators, laid_over, scaled
 from rs_localizer.tools.mapping.initial_trajectory import (
     ANGULAR_VELOCITY,
     LINEAR_VELOCITY,
@@ -234,7 +234,8 @@ class Refinement:
         modes = np.zeros((problem.groups.kept, 0))
         if self.wanted.drifts:
             modes = DRIFT * math.sqrt(inflation) * factored.modes(self.wanted.drifts)
-        points, covariances, shared, spline = _laid(problem, state, factored, images > 1)
+        whole, covariances, shared = _laid(problem, state, factored, images > 1)
+        points = whole(state.landmarks)
         covariances *= inflation
         spread = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
         refined = (images > 1) & (spread < _KNOWN * self.size)
@@ -256,15 +257,22 @@ class Refinement:
             inliers=all_squared < (LIMIT * deviation) ** 2,
             before=before,
             after=deviation,
-            spline=spline,
+            spline=whole.moved(state.spline),
             start_ns=self.start_ns,
             times=self.times,
             tells_readout=self.tells_readout,
             apart=self.wanted.apart,
         )
-        return replace(found, drifts=self._drifts(found, problem, modes))
+        return replace(found, drifts=self._drifts(found, problem, modes, whole))
 
-    def _drifts(self, found: RefinedMap, problem: Problem, modes: Array) -> tuple[RefinedMap, ...]:
+    def _drifts(
+        self, found: RefinedMap, problem: Problem, modes: Array, whole: Similarity
+    ) -> tuple[RefinedMap, ...]:
+        """Return the motion with each of the errors (N,k), laid where the map was laid.
+
+        Moves of landmarks are a difference of these, to first order: a motion that had not been
+        laid would differ by the whole similarity, of which the second order is no small error.
+        """
         drifts, still = [], np.zeros(3 * len(self.state.landmarks))
         for mode in modes.T:
             state = problem.moved(self.state, np.concatenate([mode, still]))
@@ -272,7 +280,7 @@ class Refinement:
                 _as_in(one, moved)
                 for one, moved in zip(found.cameras, problem.states(state), strict=True)
             )
-            drifts.append(replace(found, spline=state.spline, cameras=cameras))
+            drifts.append(replace(found, spline=whole.moved(state.spline), cameras=cameras))
         return tuple(drifts)
 
     def _cluster_robust(self, problem: Problem, deviation: float, independent: float) -> float:
@@ -467,8 +475,8 @@ def _as_in(one: Adjusted, state: Unknowns) -> Adjusted:
 
 def _laid(
     problem: Problem, state: Unknowns, factored: Factored, usable: BoolArray
-) -> tuple[Array, Array, Array, Spline]:
-    """Map and motion laid over the map as it was given, unless landmarks of known place hold it.
+) -> tuple[Similarity, Array, Array]:
+    """Lay a map over the one that was given, unless landmarks of known place hold it.
 
     Args:
         problem: whose minimum the state is.
@@ -477,19 +485,18 @@ def _laid(
         usable: (p,) which landmarks may hold the whole.
 
     Returns:
-        landmarks (p,3), and by the inverse of the normal matrix their covariances (p,3,3) and that
-        (s,s) of readout time and lens; the motion.
+        the similarity that lays it there; and by the inverse of the normal matrix the covariances
+        (p,3,3) of its landmarks and that (s,s) of readout time and lens.
 
     Raises:
         Undetermined: when the images leave something open.
     """
     if not problem.floating:
-        return state.landmarks, *factored.block_covariances(), state.spline
+        return scaled(1.0), *factored.block_covariances()
     given = problem.views[0].observations.landmarks
     whole, kept = laid_over(state.landmarks, given, usable)
     every = generators(state.landmarks, state.landmarks[kept].mean(axis=0))
     of_kept = np.where(kept[:, None, None], every, 0.0)
     spread = factored.solve(np.zeros((problem.groups.kept, 7)), of_kept)[1]
     covariances, shared = factored.block_covariances()
-    held = as_held(covariances, spread, every, of_kept)
-    return whole(state.landmarks), whole.covariances(held), shared, whole.moved(state.spline)
+    return whole, whole.covariances(as_held(covariances, spread, every, of_kept)), shared

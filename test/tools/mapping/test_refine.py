@@ -22,6 +22,7 @@ from rs_localizer.tools.adjust.variables import Freedom, Unknowns
 from rs_localizer.tools.mapping.gauge import through
 from rs_localizer.tools.mapping.map_keypoints import MapFreedom, MapObservations, RigCamera
 from rs_localizer.tools.mapping.refinement import (
+    DRIFT,
     RefinedMap,
     Refinement,
     refine,
@@ -77,6 +78,18 @@ def test_a_global_shutter_bends_the_map_and_the_rolling_one_does_not(video, righ
     whole = through(right.points[right.refined], video.start.points[right.refined])
     assert whole.scale == pytest.approx(1.0, abs=0.02)
     assert np.linalg.norm(whole.translation) < 0.04
+
+
+def test_errors_of_the_motion_are_laid_where_the_map_is(video, right):
+    """A map that is given 5 % too large takes its motion along, and errors of the motion."""
+    middle = video.points.mean(axis=0)
+    start = replace(video.start, points=middle + 1.05 * (video.start.points - middle))
+    found = refine(camera(), video.seen, start, MapFreedom(drifts=2))
+    ours, usual = (np.ptp(one.poses()[1], axis=0) for one in (found, right))
+    np.testing.assert_allclose(ours, 1.05 * usual, rtol=0.02)
+    for drift in found.drifts:
+        off = np.abs(drift.poses()[1] - found.poses()[1]).max()
+        assert 0.0 < off < 0.05 * DRIFT  # m: a deviation is some millimetres
 
 
 def test_a_wrong_readout_time_is_named(video, right):
