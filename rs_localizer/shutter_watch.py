@@ -13,6 +13,10 @@ sideways. The points of a frame are then off by
 map and lens, which is alike in neighbouring frames. A Kalman filter estimates ``T_r, T_c``, whose
 evidence fades, and both ``m``, which wander. The right shutter is ``(T, 0)``, a global one ``(0,
 0)``, a reversed one ``(-T, 0)``; off the first axis the shutter runs along the other one.
+
+A stabilized film has no such shutter: each image is turned as a whole, so the rotation ``r`` of a
+frame within its rows lacks what was taken out between images. What was taken out changes smoothly
+and has a mean of zero; the sum of ``r`` is the angle that poses are off by.
 """
 
 from __future__ import annotations
@@ -31,7 +35,7 @@ from rs_localizer.core.lens import centre_of
 from rs_localizer.core.rig import Rig
 from rs_localizer.core.scanning import ACROSS, REVERSED, ScanDirection
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.state import MOTION_PARAMETERS, POSE, VELOCITIES
+from rs_localizer.core.state import MOTION_PARAMETERS, POSE, TURN, VELOCITIES
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.points import find_usable, packed
 from rs_localizer.estimation.prior import state_in
@@ -72,6 +76,11 @@ _SURELY, _LEAST_DIFFERENCE = 4.0, 0.06
 _WELL_KNOWN, _ON, _CYCLE = 0.05, 3, 9
 # Below this share of the setting nothing tells the shutter from a global one.
 _GLOBAL = 0.2
+# A film is stabilized if what images turn within their rows beside the motion between them varies
+# by more than errors of map and lens do (rad per readout, rms), and smoothly: of the last frames,
+# of so many at least, neighbours correlate by more than this. Vibration changes its sign from frame
+# to frame, unless it has the images' rate.
+_TAKEN_OUT, _LAST, _LEAST, _SMOOTHLY = 3.5 * _LIKE_MOTION, 30, 12, 0.6
 # Logarithms of the odds of another shutter at which it is doubted, no longer doubted (a robot that
 # drives slowly shows neither) and certain, and of rest before a global shutter.
 _SUSPICIOUS, _SHOWN, _CERTAIN, _AT_REST = 4.0, -2.0, 8.0, 20.7
@@ -150,6 +159,9 @@ class ShutterWatch:
         self._reversed = False  # they may run the other way
         self._across = False  # or along the other axis
         self._looks: deque[_Look] = deque(maxlen=3)
+        # What the last images turn within their rows beside the motion between them, rad per frame.
+        self._beside: deque[Array] = deque(maxlen=_LAST)
+        self._taken_out = np.zeros((3, 3))  # rad^2, of the angles that a stabilizer takes out
         self._frames = 0
         if self._camera is not None:
             self._mean, self._covariance = np.zeros(14), self._any
@@ -161,7 +173,11 @@ class ShutterWatch:
         return _AT_REST if self.is_global else 0.0
 
     def widened(self, found: Estimate) -> Estimate:
-        """Return the last frame with a covariance that allows for another shutter."""
+        """Return the last frame with a covariance that allows for what the watch has found."""
+        if self._taken_out.any():
+            calibration = found.calibration_covariance.copy()
+            calibration[TURN, TURN] += self._taken_out
+            found = replace(found, calibration_covariance=calibration)
         if not (self._reversed or self._across):
             return found
         own = np.r_[found.angular_velocity, found.linear_velocity]
@@ -194,7 +210,9 @@ class ShutterWatch:
         points, pixels = map(np.ascontiguousarray, (points[some], pixels[some]))
         self._looks.append(self._look(time_ns, found, points, pixels))
         # One that vibrates within its images goes elsewhere there than between them.
-        if len(self._looks) == 3 and not _vibrates(self._looks[1].found):
+        if len(self._looks) == 3 and _vibrates(self._looks[1].found):
+            self._beside.clear()
+        elif len(self._looks) == 3:
             before, now, after = self._looks
             first, second = (now.time_ns - before.time_ns) * 1e-9, (time_ns - now.time_ns) * 1e-9
             alike = 1.0 / _MOST_UNLIKE < first / second < _MOST_UNLIKE
@@ -261,13 +279,41 @@ class ShutterWatch:
             step = covariance @ (weighed @ expected)
             variance = float(weights @ (expected - design @ step) ** 2 / np.sum(weights))
         self._mean, self._covariance = (prior + step)[6:], covariance[6:, 6:]
+        own = np.r_[0:6, 8:11]  # the pose's error, and the rotation over the rows
+        left = weighed[own] @ (now.off - self._camera.readout_time * design[:, 6])
+        beside = np.linalg.solve(weighed[own] @ design[:, own], left)[6:]
+        self._beside.append(beside * 0.5 * seconds / self._camera.readout_time)
         changed = float(np.mean(step[8:] ** 2 / wanders.diagonal()))
         changed = min(changed, _MOST_UNLIKELY * self._unlike)
         self._unlike = max(self._unlike + _LEARNING * (changed - self._unlike), 1.0)
         if self._unlike < _SHAKEN and np.all(np.abs(self._mean[:2]) < 0.55 * seconds):
+            self._taken_out[:] = 0.0
             self._judge(self._camera.readout_time)
-        elif not self.kind:
+        elif self.kind in ("", "stabilized"):
             self.trusted, self._reversed, self._across = True, False, False
+            self._judge_stabilizer(0.5 * seconds)
+
+    def _judge_stabilizer(self, interval: float) -> None:
+        """Judge whether images are turned as a whole: no shutter turns them as they are."""
+        assert self._camera is not None
+        beside = np.array(self._beside) - np.mean(self._beside, axis=0)
+        angles, square = np.cumsum(beside, axis=0), float(np.sum(beside**2))
+        turned = math.sqrt(square / len(beside))  # rad per frame
+        smoothly = float(np.sum(beside[1:] * beside[:-1])) > _SMOOTHLY * square
+        large = turned * self._camera.readout_time > _TAKEN_OUT * interval
+        self.kind, self.fault = "", ""
+        self._taken_out[:] = 0.0
+        if len(beside) < _LEAST or not (smoothly and large):
+            return
+        angles -= angles[-1]  # one of them, nobody knows which, is none
+        self._taken_out += angles.T @ angles / len(angles)
+        self.kind = "stabilized"
+        self.fault = (
+            f"rows show rotations that differ by {math.degrees(turned / interval):.0f} deg/s (rms) "
+            "from those between images, which no shutter does: is the film stabilized? Poses are "
+            "those of the picture that it shows; switch stabilization off (a camera that vibrates "
+            "at the image rate looks the same)"
+        )
 
     def _along(self, axis: int) -> MeasuredReadout:
         """Return the readout time along an axis, if the shutter moves along it."""

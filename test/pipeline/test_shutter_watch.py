@@ -189,6 +189,36 @@ def test_a_global_shutter_is_known_within_a_second_and_has_no_twist(tracking):
     assert np.linalg.norm(found[29].estimate.angular_velocity) < 1e-4  # 0.3 deg/s
 
 
+def stabilized(share: float) -> list[tuple[Any, TrueState]]:
+    """Return frames turned as wholes, by a share of the way to half a second's orientation."""
+    seen = frames_with_truth()
+    turns = Rotation.from_matrix(np.array([true.rotations[0] for _, true in seen]))
+    turned = []
+    for k, (message, true) in enumerate(seen):
+        mean = turns[max(k - 7, 0) : k + 8].mean()
+        cloud = read_correspondences(message)
+        back = Rotation.from_rotvec(share * (mean.inv() * turns[k]).as_rotvec()).as_matrix()
+        pixels = CAMERA.project(CAMERA.bearings(cloud.pixels) @ back.T)
+        turned.append((cloud_of(cloud.stamp_ns, cloud.points, pixels), true))
+    return turned
+
+
+@pytest.mark.parametrize("share", [0.9, 0.6])
+def test_a_stabilized_film_is_named_and_orientations_allow_for_it(share):
+    seen = Watched(FRAMES - 1, stabilized(share), readout_time=READOUT)
+    assert seen.watch.kind == "stabilized"
+    assert [text for text in seen.notices if "is the film stabilized" in text]
+    inside = [
+        within(
+            logarithm((found.pose.rotation @ true.rotations[0].T)[None])[0],
+            found.pose.covariance[3:, 3:],
+        )
+        for found, (_, true) in zip(seen.results, frames_with_truth(), strict=False)
+        if found
+    ]
+    assert np.mean(inside[30:]) > 0.9
+
+
 @pytest.mark.parametrize("change", ["reset", "settings", "camera", "map"])
 def test_what_changes_starts_afresh(change):
     seen = Watched(2, readout_time=0.8 * READOUT)

@@ -157,7 +157,6 @@ def build_map(inputs: Given, work: Workshop) -> Built:
         ValueError: when the images make no map, saying what was found.
     """
     check_views(inputs.views)
-    unsharp = blurred(inputs.views)
     keyframes = choose_keyframes(inputs.views)
     structure = _structure(inputs, keyframes, work)
     camera = replace(
@@ -166,7 +165,25 @@ def build_map(inputs: Given, work: Workshop) -> Built:
         scan_direction=likely_axes(structure.camera.size, inputs.scan_direction)[0],
     )
     with work.stage("track", len(inputs.views)) as step:
-        rows, shown, start = track_on_map(inputs.views, structure, camera, lambda: step(1))
+        tracked = track_on_map(inputs.views, structure, camera, lambda: step(1))
+    built = built_from(inputs, structure, tracked, camera, work)
+    return replace(built, keyframes=keyframes)
+
+
+def built_from(
+    inputs: Given, structure: Structure, tracked: tuple[IntArray, MapObservations, Start],
+    camera: Camera, work: Workshop,
+) -> Built:  # fmt: skip
+    """Build a map from a first structure.
+
+    Args:
+        tracked: rows of the views with a pose, what they show, and a first guess of their poses.
+        camera: its lens, with the readout time, or 0 if nobody knows it.
+
+    Raises:
+        ValueError: when the images make no map, saying what was found.
+    """
+    rows, shown, start = tracked
     used, adjusted, near = adjusted_part(shown, start, work.effort.adjusted)
     refined, shutter, check = _refined(inputs, adjusted, near, camera, work)
     estimated = None if inputs.camera is not None else structure.camera.focal_length
@@ -192,8 +209,8 @@ def build_map(inputs: Given, work: Workshop) -> Built:
         ),
         camera=refined.camera_as_found,
         placement=place,
-        keyframes=keyframes,
-        blurred=unsharp,
+        keyframes=structure.views,
+        blurred=blurred(inputs.views),
         structure=replace(structure, start=structure.start.moved(similarity)),
         kept=kept,
         shutter=shutter,
