@@ -29,6 +29,8 @@ _USUAL_MISFIT = 0.005, 0.002
 # Distances contradict each other when the scales that they ask for differ by more than this part.
 _MOST_CONTRADICTION = 0.03
 _LEAST_CORNERS = 4
+# Standard deviation (m) of corners in their map: prints are measured to within this.
+_DEVIATION = 0.001
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,10 +165,12 @@ def _by_markers(marker_map: MarkerMap, triangulated: Triangulated) -> Placement:
             f"{np.count_nonzero(determined)} corners of the marker map are seen by three images or "
             f"more, {_LEAST_CORNERS} are needed: show the markers from several places"
         )
-    similarity = through(places[determined], truth[determined])
+    # A corner that was seen briefly is known worse than its print.
+    spread = np.hypot(triangulated.spread[: len(truth)][determined], _DEVIATION)
+    similarity = through(places[determined], truth[determined], spread)
     errors = np.linalg.norm(similarity(places[determined]) - truth[determined], axis=1)
     extent = float(np.linalg.norm(np.ptp(truth[determined], axis=0)))
-    misfit = float(np.sqrt(np.mean(errors**2)))
+    misfit = float(np.sqrt(np.average(errors**2, weights=spread**-2.0)))
     if misfit > _MOST_MISFIT * extent:
         raise MappingError(
             f"the markers do not lie where their map says: corners are off by {1e3 * misfit:.0f} "
@@ -196,8 +200,6 @@ def _down(rotations: Array) -> Array:
     return axis if axis @ down >= 0.0 else -axis
 
 
-# Standard deviation (m) of corners in their map: prints are measured to within this.
-_DEVIATION = 0.001
 # Observations that determine a corner.
 _LEAST_OBSERVATIONS = 3
 

@@ -57,25 +57,30 @@ def scaled(factor: float) -> Similarity:
     return Similarity(factor, np.eye(3), np.zeros(3))
 
 
-def through(points: Array, there: Array) -> Similarity:
+def through(points: Array, there: Array, spread: Array | None = None) -> Similarity:
     """Return the similarity from points (n,3) to places (n,3) with the least squared distances.
 
     S. Umeyama, Least-squares estimation of transformation parameters between two point patterns,
     PAMI 1991.
+
+    Args:
+        spread: (n,) m, how well each distance is known; None: all alike.
 
     Raises:
         ValueError: for fewer than three points, or points on a line.
     """
     if len(points) < 3:
         raise ValueError(f"three points or more determine a frame and its scale, got {len(points)}")
-    middle, other = points.mean(axis=0), there.mean(axis=0)
+    weights = np.ones(len(points)) if spread is None else spread**-2.0
+    weights = (weights / weights.sum())[:, None]
+    middle, other = np.sum(weights * points, axis=0), np.sum(weights * there, axis=0)
     x, y = points - middle, there - other
-    u, spread, vt = np.linalg.svd(y.T @ x / len(x))
-    if spread[1] < _FLAT * spread[0]:
+    u, spreads, vt = np.linalg.svd(y.T @ (weights * x))
+    if spreads[1] < _FLAT * spreads[0]:
         raise ValueError("points on one line do not determine a frame")
     signs = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
     rotation = (u * signs) @ vt
-    scale = float(spread @ signs / np.mean(np.sum(x**2, axis=1)))
+    scale = float(spreads @ signs / np.sum(weights * x**2))
     return Similarity(scale, rotation, other - scale * rotation @ middle)
 
 

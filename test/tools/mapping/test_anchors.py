@@ -50,6 +50,17 @@ def test_markers_give_frame_and_scale():
     assert "mm (rms) off their map" in placed(Anchors(WALL), back(points)).doubt
 
 
+def test_a_marker_that_was_seen_briefly_moves_no_map():
+    points, covariances = WALL.points.copy(), np.tile(1e-8 * np.eye(3), (len(WALL.points), 1, 1))
+    points[:4] += [0.0, 0.02, 0.03]
+    covariances[:4] = 0.03**2 * np.eye(3)
+    seen = Triangulated(back(points), covariances, np.full(len(points), 9), 0.1)
+    placement_of = placement(Anchors(WALL), seen, HELD.as_matrix(), np.zeros((6, 3)))
+    off = placement_of.similarity(back(WALL.points)) - WALL.points
+    assert np.abs(off).max() < 1e-4
+    assert placement_of.doubt == ""
+
+
 def test_a_wrong_marker_map_is_refused():
     points = back(WALL.points)
     points[:4] += 0.5
