@@ -387,7 +387,9 @@ class Tracker:
     def _accepted(self, found: Estimate | Failure) -> Estimate | Failure:
         """Return the estimate, or the reason why it is not published."""
         if found and self.shutter.refusal:
-            return Failure(Reason.SCAN_AXIS, self.shutter.refusal)
+            of_axis = self.shutter.kind == "axis"
+            reason = Reason.SCAN_AXIS if of_axis else Reason.CALIBRATION
+            return Failure(reason, self.shutter.refusal)
         if found and self.lens.refusal:
             return Failure(Reason.CALIBRATION, self.lens.refusal)
         return self.localizer.accepted(found)

@@ -189,6 +189,50 @@ def test_a_global_shutter_is_known_within_a_second_and_has_no_twist(tracking):
     assert np.linalg.norm(found[29].estimate.angular_velocity) < 1e-4  # 0.3 deg/s
 
 
+def squeezed(share: float) -> list[tuple[Any, TrueState]]:
+    """Return frames of which the rows were moved towards the middle one."""
+    seen = []
+    for message, true in frames_with_truth():
+        cloud = read_correspondences(message)
+        pixels = cloud.pixels.copy()
+        pixels[:, 1] += share * (CAMERA.K[1, 2] - pixels[:, 1])
+        seen.append((cloud_of(cloud.stamp_ns, cloud.points, pixels), true))
+    return seen
+
+
+def test_squeezed_images_are_named_and_twists_allow_for_it():
+    """Before fy over fx that is off by 2 % the camera seems to pitch by 1 rad/s."""
+    seen = Watched(FRAMES - 1, squeezed(0.02), readout_time=READOUT)
+    (text,) = [text for text in seen.notices if "squeezed by 2 % (fy over fx)" in text]
+    assert "which no shutter does" in text
+    inside = [
+        within(found.twist.angular - true.angular[0], found.twist.covariance[3:, 3:])
+        for found, (_, true) in zip(seen.results, frames_with_truth(), strict=False)
+        if found and found.twist is not None
+    ]
+    assert len(inside) > 70
+    assert np.mean(inside[10:]) > 0.9
+
+
+def test_images_that_are_squeezed_by_a_tenth_give_no_poses():
+    seen = Watched(FRAMES - 1, squeezed(0.1), readout_time=READOUT)
+    assert "squeezed by 10 % (fy over fx)" in seen.watch.refusal
+    assert np.mean([bool(found) for found in seen.results[20:]]) < 0.1
+
+
+@pytest.mark.parametrize("readout", [READOUT, 0.0])
+@pytest.mark.parametrize("rate", [0.5, 1.5])
+def test_a_camera_that_turns_steadily_is_told_no_squeeze(readout, rate):
+    """Before a global shutter its rows lack a rotation that is the same in all images."""
+    motion = ConstantVelocity(np.array([0.4 * rate, rate, 0.0]), np.array([0.3, 0.0, 0.0]), 2.0)
+    world = room(motion.state(0, np.linspace(0, 2, 6)).positions, np.random.default_rng(0), 5000)
+    tracker = Tracker(Localizer(CAMERA))
+    seen, camera = FrameSettings(100, 0.2, 0.1), changed(CAMERA, readout_time=readout)
+    for frame in simulate_frames(camera, motion, world, seen):
+        tracker.localize(frame.stamp_ns + 10**18, frame.points, frame.pixels)
+        assert tracker.shutter.kind in ("", "global")
+
+
 def stabilized(share: float) -> list[tuple[Any, TrueState]]:
     """Return frames turned as wholes, by a share of the way to half a second's orientation."""
     seen = frames_with_truth()
