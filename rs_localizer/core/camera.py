@@ -348,7 +348,7 @@ class Camera:
             towards = np.column_stack([self.rays(pixels), np.ones(len(pixels))])
         else:
             sensor = pixels * self.binning + self._offset()
-            towards = sphere.look((sensor - self.K[:2, 2]) / np.diag(self.K)[:2], self.D)
+            towards = sphere.find_bearings((sensor - self.K[:2, 2]) / np.diag(self.K)[:2], self.D)
             lost = ~(np.abs(self.project(towards) - pixels) < _ROUND_TRIP_TOLERANCE).all(axis=1)
             towards[lost] = np.nan
         return np.asarray(towards / np.linalg.norm(towards, axis=1, keepdims=True))

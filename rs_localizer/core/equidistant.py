@@ -37,7 +37,7 @@ def widest(D: Array) -> float:
     return float(np.sqrt(min([np.pi**2, *folds])))
 
 
-def see(bearings: Array, D: Array) -> Seen:
+def project_bearings(bearings: Array, D: Array) -> Seen:
     """Return the places that bearings (n,3) hit, with derivatives; NaN beyond :func:`widest`."""
     z = bearings[:, 2]
     across = np.hypot(bearings[:, 0], bearings[:, 1])
@@ -63,7 +63,7 @@ def see(bearings: Array, D: Array) -> Seen:
     )  # fmt: skip
 
 
-def look(places: Array, D: Array) -> Array:
+def find_bearings(places: Array, D: Array) -> Array:
     """Return bearings (n,3) of places (n,2) in focal lengths from the centre; NaN where none is."""
     radius = np.hypot(places[:, 0], places[:, 1])
     most = widest(D)
@@ -81,4 +81,4 @@ def look(places: Array, D: Array) -> Array:
     return np.column_stack([scale[:, None] * places, np.cos(angle)])
 
 
-EQUIDISTANT: LensLaw = sphere_law(see, look, 4)
+EQUIDISTANT: LensLaw = sphere_law(project_bearings, find_bearings, 4)

@@ -18,7 +18,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.lens_laws import LensLaw, Seen, onto_sensor, sphere_law
 
 
-def see(bearings: Array, D: Array) -> Seen:
+def project_bearings(bearings: Array, D: Array) -> Seen:
     """Return the places (n,2) that bearings (n,3) hit, in focal lengths, with all derivatives."""
     alpha, beta = D[:2]
     x, y, z = bearings.T
@@ -37,7 +37,7 @@ def see(bearings: Array, D: Array) -> Seen:
     )
 
 
-def look(places: Array, D: Array) -> Array:
+def find_bearings(places: Array, D: Array) -> Array:
     """Return bearings (n,3) of places (n,2) in focal lengths from the centre; NaN where none is."""
     alpha, beta = D[:2]
     square = (places**2).sum(axis=1)
@@ -47,4 +47,4 @@ def look(places: Array, D: Array) -> Array:
     return np.column_stack([places, ahead])
 
 
-EUCM: LensLaw = sphere_law(see, look, 2, limits=((0.0, 1.0), (1e-3, 1e3)))
+EUCM: LensLaw = sphere_law(project_bearings, find_bearings, 2, limits=((0.0, 1.0), (1e-3, 1e3)))

@@ -82,7 +82,7 @@ def with_lens(camera: Camera, coefficients: Array) -> Camera:
 
 def by_lens(camera: Camera, towards: Array) -> Array:
     """Return derivatives (n,2,k) of the pixels of rays (n,2) or bearings (n,3) by coefficients."""
-    projected = _law_of(camera).see(towards, camera.K, _distortion_of(camera))
+    projected = _law_of(camera).project_towards(towards, camera.K, _distortion_of(camera))
     correctable = projected.by_coefficients[:, :, : _distorting(camera)]
     columns = np.concatenate([correctable, projected.by_matrix], axis=2)
     scaled: Array = columns * _scales_of(camera) / np.array(camera.binning)[:, None]

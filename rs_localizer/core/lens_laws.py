@@ -41,12 +41,12 @@ class Seen(NamedTuple):
 class Sphere(NamedTuple):
     """How a lens sees bearings of any direction, also those behind the image plane."""
 
-    see: Callable[[Array, Array], Seen]  # bearings (n,3), D
-    look: Callable[[Array, Array], Array]  # places, D: bearings (n,3) of any length
+    project_bearings: Callable[[Array, Array], Seen]  # bearings (n,3), D
+    find_bearings: Callable[[Array, Array], Array]  # places, D: bearings (n,3) of any length
 
     def project(self, bearings: Array, K: Array, D: Array) -> Projection:
         """Project bearings (n,3) in the place of rays; ``by_ray`` is (n,2,3)."""
-        seen, focal = self.see(bearings, D), np.diag(K)[:2]
+        seen, focal = self.project_bearings(bearings, D), np.diag(K)[:2]
         by_matrix = np.zeros((len(bearings), 2, 4))
         for axis in range(2):
             by_matrix[:, axis, axis], by_matrix[:, axis, 2 + axis] = seen.places[:, axis], 1.0
@@ -79,7 +79,7 @@ class LensLaw(NamedTuple):
     # powers of the radius at once: one of 1 moves the corner by its distance from the centre.
     limits: tuple[tuple[float, float], ...] | None = None
 
-    def see(self, towards: Array, K: Array, D: Array) -> Projection:
+    def project_towards(self, towards: Array, K: Array, D: Array) -> Projection:
         """Project rays (n,2) or bearings (n,3); ``by_ray`` is (n,2,2) or (n,2,3)."""
         if towards.shape[1] == 2:
             return self.project(towards, K, D)
@@ -136,27 +136,27 @@ def onto_sensor(bearings: Array, below: Array, by_bearing: Array, by_coefficient
 
 
 def sphere_law(
-    see: Callable[[Array, Array], Seen],
-    look: Callable[[Array, Array], Array],
+    project_bearings: Callable[[Array, Array], Seen],
+    find_bearings: Callable[[Array, Array], Array],
     coefficients: int,
     limits: tuple[tuple[float, float], ...] | None = None,
 ) -> LensLaw:
     """Return the law of a lens that sees bearings (n,3) of any direction.
 
     Args:
-        see: of bearings and D.
-        look: bearings of places (n,2), in focal lengths from the centre, and D.
+        project_bearings: of bearings and D.
+        find_bearings: bearings of places (n,2), in focal lengths from the centre, and D.
         coefficients: how many it has; without any it is a pinhole where it has no limits.
         limits: of each.
     """
-    sphere = Sphere(see, look)
+    sphere = Sphere(project_bearings, find_bearings)
 
     def project(rays: Array, K: Array, D: Array) -> Projection:
         projected = sphere.project(np.column_stack([rays, np.ones(len(rays))]), K, D)
         return projected._replace(by_ray=projected.by_ray[:, :, :2])
 
     def undistort(pixels: Array, K: Array, D: Array) -> Array:
-        bearings = look((pixels - K[:2, 2]) / np.diag(K)[:2], D)
+        bearings = find_bearings((pixels - K[:2, 2]) / np.diag(K)[:2], D)
         ahead = np.where(bearings[:, 2:] > 0.0, bearings[:, 2:], np.nan)
         return np.asarray(bearings[:, :2] / ahead)
 

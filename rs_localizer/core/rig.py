@@ -241,7 +241,7 @@ class Side(NamedTuple):
         if self.axes is None:
             return projected(self.camera, rays)[1]
         camera = self.camera
-        by_bearing = camera.law.see(self.towards(rays), camera.K, camera.D).by_ray
+        by_bearing = camera.law.project_towards(self.towards(rays), camera.K, camera.D).by_ray
         by_ray: Array = by_bearing @ self.axes[:2].T / np.array(camera.binning)[:, None]
         return by_ray
 
