@@ -36,6 +36,7 @@ _LOOKING = 4.0
 _WORKING = 22.0
 # A state that holds so long (s) is the answer.
 _STEADY = 4.0
+_UNHEARD = Refusals(lambda _: None)
 _NAMESPACE, _IMAGE_TYPE = "/doctor", "sensor_msgs/msg/Image"
 FILE = Path("rs_localizer_doctor.yaml")
 
@@ -63,7 +64,7 @@ class Surroundings:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._topics: dict[str, Topic] = {}
+        self._heard: dict[str, Inputs] = {}  # by topic
         self._found: dict[str, set[str]] = {}
         self.images: dict[str, str] = {}
 
@@ -73,19 +74,13 @@ class Surroundings:
 
     def until(self, stopped: Callable[[], bool]) -> None:
         """Look at the surroundings until it is to stop."""
-        listening: Inputs | None = None
         executor = executor_of(self._node.context)
         executor.add_node(self._node)
         while not stopped():
-            before = len(self._topics)
             self._find()
-            if len(self._topics) > before:
-                if listening is not None:
-                    listening.close()
-                listening = Inputs(self._node, self._topics, Refusals(lambda _: None))
             executor.spin_once(timeout_sec=0.1)
-        if listening is not None:
-            listening.close()
+        for inputs in self._heard.values():
+            inputs.close()
         executor.remove_node(self._node)
 
     def _find(self) -> None:
@@ -97,8 +92,9 @@ class Surroundings:
             if not self._node.count_publishers(name):
                 continue
             for kind, (message, take) in takers.items():
-                if kind in kinds and name not in self._topics:
-                    self._topics[name] = Topic(message, partial(take, name), LATCHED)
+                if kind in kinds and name not in self._heard:
+                    topic = Topic(message, partial(take, name), LATCHED)
+                    self._heard[name] = Inputs(self._node, {name: topic}, _UNHEARD)
             for kind, wanted in ((CAMERA_INFO_TYPE, topics.CAMERA_INFO), (IMU_TYPE, topics.IMU)):
                 if kind in kinds:
                     self._found.setdefault(wanted, set()).add(name)

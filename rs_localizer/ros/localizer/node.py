@@ -108,7 +108,7 @@ class Publisher:
         if camera is not None and self._wanted(CAMERA_MARKER):
             marker = MarkerArray(markers=[camera_marker(frame, camera.view_corners)])
             self._publishers[CAMERA_MARKER].publish(marker)
-        if math.isfinite(frame.estimate.integrity):
+        if math.isfinite(frame.estimate.integrity) and self._wanted(INTEGRITY):
             self._publishers[INTEGRITY].publish(integrity_message(frame))
 
     def publish_motion(self) -> None:
