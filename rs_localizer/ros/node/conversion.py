@@ -13,6 +13,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.serialization import deserialize_message
 from rclpy.timer import Timer
 
 _OUTPUT = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
@@ -51,23 +52,11 @@ def make_message(type_name: str, **fields: Any) -> Any:
 
 def copy_message(source: Any, type_name: str) -> Any:
     """Make the rclpy message of this type with the values of a message of rosbags."""
-    fields = {}
-    for name, kind in message_class(type_name).get_fields_and_field_types().items():
-        value = getattr(source, name)
-        if "/" not in kind:
-            is_array = isinstance(value, np.ndarray)
-            fields[name] = value.astype(value.dtype.newbyteorder("=")) if is_array else value
-        elif kind.startswith("sequence<"):
-            element = _full_name(kind.removeprefix("sequence<").split(",")[0].rstrip(">"))
-            fields[name] = [copy_message(item, element) for item in value]
-        else:
-            fields[name] = copy_message(value, _full_name(kind))
-    return make_message(type_name, **fields)
+    from rs_localizer.io.bags import typestore  # recordings, which the nodes never read
 
-
-def xyz(vector: Any) -> Any:
-    """Return the numbers (3,) of a Point, a Vector3 or a Quaternion without its w."""
-    return np.array([vector.x, vector.y, vector.z])
+    return deserialize_message(
+        bytes(typestore().serialize_cdr(source, type_name)), message_class(type_name)
+    )
 
 
 def create_output(node: Any, kind: type, topic: str, *, overridable: bool = False) -> Any:
@@ -84,8 +73,3 @@ def create_output(node: Any, kind: type, topic: str, *, overridable: bool = Fals
 def steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
     """Create a timer (s) that goes on whatever ROS time does."""
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-
-def _full_name(kind: str) -> str:
-    package, name = kind.split("/")
-    return f"{package}/msg/{name}"
