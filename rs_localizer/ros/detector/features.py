@@ -26,11 +26,9 @@ def tell(extracted: Extracted) -> tuple[int, Told]:
 class FeatureDetectorNode(ImageNode[FeatureConfig, Extracted]):
     """Looks for keypoints."""
 
-    task = FEATURES_NAME
+    node_name = task = FEATURES_NAME
+    kind, tell = FeatureConfig, staticmethod(tell)
     output = KEYPOINTS
-
-    def __init__(self, **options: Any) -> None:
-        super().__init__(FEATURES_NAME, FeatureConfig, tell, **options)
 
     def make_finder(self, config: FeatureConfig) -> FrameExtractor:
         return FrameExtractor(config)

@@ -7,7 +7,7 @@ It listens to images only while somebody listens to it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -33,7 +33,7 @@ from rs_localizer.ros.node.diagnostics import (
     out_of_service,
 )
 from rs_localizer.ros.node.managed import ManagedNode
-from rs_localizer.ros.node.statistics import WINDOW, Summary, Told
+from rs_localizer.ros.node.statistics import WINDOW, Summary
 from rs_localizer.ros.node.subscriptions import Silence, Topic
 
 Result = TypeVar("Result")
@@ -75,17 +75,11 @@ class ImageNode(ManagedNode[Settings, Result], Generic[Settings, Result]):
     output: ClassVar[str]  # topic of the clouds
     odd: ClassVar[tuple[Notice, ...]] = (Notice.TWO_PUBLISHERS,)  # that the diagnostics repeat
 
-    def __init__(
-        self,
-        name: str,
-        kind: Any,  # class of its settings, which mypy cannot follow to the base class
-        tell: Callable[[Result], tuple[int, Told]],
-        **options: Any,
-    ) -> None:
+    def __init__(self, **options: Any) -> None:
         self._finder: Any = None  # from configuring on the worker's
         self._outputs: tuple[Any, ...] = ()  # publishers of clouds and of debug pictures
         self._listening: tuple[str, ...] = ()
-        super().__init__(name, kind, tell, **options)
+        super().__init__(**options)
 
     # -- what a node looks for ---------------------------------------------------------------
 

@@ -41,15 +41,13 @@ def tell(detected: Detected) -> tuple[int, Told]:
 class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):
     """Looks for markers."""
 
-    task = DETECTOR_NAME
+    node_name = task = DETECTOR_NAME
+    kind, tell = DetectorConfig, staticmethod(tell)
     output = CORRESPONDENCES
     odd = (
         Notice.OTHER_BOARD, Notice.REPEATED_MARKERS, Notice.TWO_PUBLISHERS, Notice.WOULD_FIT,
     )  # fmt: skip
     checked_at_start = False  # the map may come later: on_configure tells
-
-    def __init__(self, **options: Any) -> None:
-        super().__init__(DETECTOR_NAME, DetectorConfig, tell, **options)
 
     def check(self, config: DetectorConfig) -> None:
         # Before it is configured, the map may still be missing.

@@ -140,7 +140,7 @@ class Publisher:
 class LocalizerNode(ManagedNode[NodeConfig, Localized]):
     """Localizes; see :class:`rs_localizer.ros.node.managed.ManagedNode`."""
 
-    task = "localizer"
+    node_name, kind, tell, task = NODE_NAME, NodeConfig, staticmethod(tell), "localizer"
     lack = Notice.NO_POSE
 
     def __init__(self, **options: Any) -> None:
@@ -148,7 +148,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         self._publisher: Publisher | None = None
         self._ticks: Timer | None = None  # of output_rate
         self._needs_tf = True  # of readings whose axes are not the camera's
-        super().__init__(NODE_NAME, NodeConfig, tell, **options)
+        super().__init__(**options)
         self._broadcaster = Broadcaster(self, self.refusals)
         self._clock_watch = watch_clock(self, self._time_jumped)
 

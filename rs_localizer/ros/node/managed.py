@@ -43,31 +43,28 @@ class ManagedNode(SettingsNode[Config], Generic[Config, Result]):
     :meth:`change` and :meth:`examine`.
 
     Args:
-        name, kind, options: as of :class:`.SettingsNode`.
-        tell: returns the stamp (ns) and the statistics of a result.
+        options: of rclpy's node.
     """
 
+    node_name: ClassVar[str]
+    kind: ClassVar[Any]  # class of its settings
+    tell: "ClassVar[staticmethod[[Any], tuple[int, Told]]]"  # a string: Python cannot subscript it
+    """Returns the stamp (ns) and the statistics of a result."""
     task: ClassVar[str]  # in the name of the diagnosis
     lack: ClassVar[str]  # the notice of what it waits for
 
-    def __init__(
-        self,
-        name: str,
-        kind: Any,  # class of its settings, which mypy cannot follow to the base class
-        tell: Callable[[Result], tuple[int, Told]],
-        **options: Any,
-    ) -> None:
+    def __init__(self, **options: Any) -> None:
         self.worker: Worker[Result] | None = None  # from configuring to cleaning up
         self._inputs: Inputs | None = None
         self.opened = contextlib.ExitStack()
         """What is undone when the node is cleaned up."""
         self.active = contextlib.ExitStack()
         """What is undone when the node is deactivated."""
-        super().__init__(name, kind, **options)
+        super().__init__(self.node_name, self.kind, **options)
         self.autostart: bool = self.config.autostart
         self.refusals = Refusals(self.warn)
         self.statistics: Statistics[Result] = Statistics(
-            self.refusals, tell, lambda: int(self.get_clock().now().nanoseconds)
+            self.refusals, self.tell, lambda: int(self.get_clock().now().nanoseconds)
         )
         self._diagnostics = Diagnostics(
             self, self.examine, self.refusals.notice, self.task, self.lack
