@@ -182,10 +182,10 @@ def half_moved(distance: float, seen: Seen, rng: np.random.Generator) -> Seen:
 
 
 def stretched(share: float, seen: Seen, rng: np.random.Generator) -> Seen:
-    """The map is longer in one direction than the room."""
-    along = rng.normal(size=3)
+    """The map is longer in one direction than the room, and lies as that does in the middle."""
+    along, away = rng.normal(size=3), seen.points - seen.points.mean(axis=0)
     along /= np.linalg.norm(along)
-    return seen._replace(points=seen.points + share * (seen.points @ along)[:, None] * along)
+    return seen._replace(points=seen.points + share * (away @ along)[:, None] * along)
 
 
 def _kinds() -> list[Kind]:
@@ -218,6 +218,8 @@ def _kinds() -> list[Kind]:
         Kind("half map moved 3 cm, room", _room, partial(half_moved, 0.03)),
         Kind("map stretched by 1 %, corner", _corner, partial(stretched, 0.01)),
         Kind("map stretched by 1 %, wall", _wall, partial(stretched, 0.01)),
+        Kind("so, map_deviation 5 mm, wall", _wall, partial(stretched, 0.01),
+             settings=NodeConfig(map_deviation=0.005)),
     ]  # fmt: skip
 
 

@@ -10,10 +10,14 @@ import numpy as np
 
 from rs_localizer.core.arrays import BoolArray
 from rs_localizer.tools.mapping.build import Built
+from rs_localizer.tools.mapping.map_keypoints import MapObservations
 from rs_localizer.tools.mapping.seen_images import SeenImage
 
 # Advice is given where more than this share of the images is blurred or has no pose.
 _MANY = 0.1
+# A walk comes back if this share of what its last images show was shown by its first ones, a tenth
+# of all each. What lies between holds together by neighbours alone, whose errors add up.
+_AGAIN, _ENDS = 0.1, 0.1
 
 
 def rows(built: Built, images: int, views: int) -> list[tuple[str, str]]:
@@ -51,6 +55,7 @@ def rows(built: Built, images: int, views: int) -> list[tuple[str, str]]:
 
 def advice(built: Built, views: Sequence[SeenImage]) -> list[str]:
     """Return sentences on how to film a better map."""
+    assert built.landmarks.error_modes is not None
     said = []
     posed = np.zeros(len(views), np.bool_)
     posed[built.posed] = True
@@ -65,6 +70,14 @@ def advice(built: Built, views: Sequence[SeenImage]) -> list[str]:
             f"{sum(built.structure.parts[1:])} keyframes are not connected with the others: film "
             "what lies between, and come back to where you began"
         )
+    if not comes_back(built.structure.seen):
+        shared = 1e3 * np.median(np.linalg.norm(built.landmarks.error_modes, axis=(1, 2)))
+        unit = "mm" if built.placement.scaled else "thousandths of the map's unit"
+        said.append(
+            f"the last images show nothing that the first ones do: landmarks share errors of "
+            f"{shared:.1f} {unit}, larger ones towards the ends; come back to where you began, or "
+            "show markers at both ends"
+        )
     shutter = built.shutter
     known = shutter.visible and shutter.axis_known if shutter else not built.refined.apart
     if not known:
@@ -73,6 +86,15 @@ def advice(built: Built, views: Sequence[SeenImage]) -> list[str]:
             "and rotate the camera quickly, sideways and up and down, for some seconds"
         )
     return said
+
+
+def comes_back(seen: MapObservations) -> bool:
+    """Return whether the last images show landmarks that the first ones show."""
+    count = len(seen.stamps_ns)
+    ends = max(1, round(_ENDS * count))
+    first = np.unique(seen.landmarks[seen.images < ends])
+    last = np.unique(seen.landmarks[seen.images >= count - ends])
+    return len(np.intersect1d(first, last)) >= _AGAIN * min(len(first), len(last))
 
 
 def written(built: Built, images: int, views: Sequence[SeenImage]) -> str:
