@@ -13,10 +13,10 @@ import logging
 import socket
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from rs_localizer import __version__
 from rs_localizer.io.atomic_files import (
     atomic_directory,
     atomic_files,
@@ -34,6 +34,7 @@ MARKER, LOG = "fleet.json", "log.txt"
 SUMMARY = "summary.csv"
 """A row of each recording."""
 
+_PACKAGE = "rs_localizer"
 # Scheduler that answers nothing for so long is none, s.
 _CONNECT_TIMEOUT = 5.0
 # Level of what Dask logs: what goes wrong is an outcome or an error.
@@ -78,7 +79,7 @@ def tasks_of(
             name = f"{place.parent.name}_{name}"
         while name in made:
             name += "_"
-        made[name] = Task(work, place, out / name, f"{__version__} {settings}")
+        made[name] = Task(work, place, out / name, f"{version(_PACKAGE)} {settings}")
     return list(made.values())
 
 
@@ -99,7 +100,7 @@ def perform(task: Task) -> Outcome:
     """
     ignore_working_folder()  # of a worker of Dask, which another program has started
     here, (said, inner) = socket.gethostname(), (io.StringIO(), task.folder)
-    if not task.settings.startswith(f"{__version__} "):
+    if not task.settings.startswith(f"{version(_PACKAGE)} "):
         return f"the worker on {here} has another rs_localizer: install the same"
     if not task.folder.parent.is_dir():
         return f"the worker on {here} does not see {task.folder.parent}"

@@ -83,7 +83,7 @@ def test_of_a_worker_that_another_program_has_started(sent):
         "import sys\nfrom pathlib import Path\n"
         "from rs_localizer.offline import fleet\n"
         "def later(*_):\n    import later\n"
-        "out, said = Path('out').absolute(), f'{fleet.__version__} x'\n"
+        "out, said = Path('out').absolute(), f'{fleet.version(\"rs_localizer\")} x'\n"
         "task = fleet.Task(later, Path('a.mcap'), out, said)\n"
     )
     assert ran(sent, "-c", f"{work}later()") == ["later"]
