@@ -134,7 +134,8 @@ def _eliminated(points: Array, rays: Array, tau: Array) -> Array:
     turns = [[r * np.cross(axis, one) for one in turned] for axis in _AXES]
     whole = np.array([[_seen(one, rays) for one in column] for column in (*turns, turned)])
     free = np.linalg.qr(_of_translations(rays, tau), mode="complete")[0][:, :, 6:]
-    return np.einsum("her,jkhe->hrjk", free, whole, optimize=True)
+    coefficients: Array = np.einsum("her,jkhe->hrjk", free, whole, optimize=True)
+    return coefficients
 
 
 def _candidates(a: Array, bound: float) -> tuple[IntArray, Array]:
