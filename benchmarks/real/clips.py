@@ -7,7 +7,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +15,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.camera import Camera, DistortionModel
-from rs_localizer.io.video import Image, Video
+from rs_localizer.io.video import Video
 from rs_localizer.markers.boards import find_chessboard
 from rs_localizer.markers.prints import Chessboard
 from rs_localizer.tools import verdict
@@ -60,7 +59,7 @@ def clips_of(folder: Path, cache: Path, most: int, only: list[str]) -> list[Clip
             continue
         columns, lines = (int(word) for word in corners.split("x"))
         board, path = Chessboard(columns, lines, float(square)), folder / name
-        clip = clip_of(path.stem, video_images(path), board, cache, most)
+        clip = _clip_of(path, board, cache, most)
         if len(clip.images) < _FEWEST:
             print(f"{name}: {len(clip.images)} images show a board of {corners} corners: left out")
         else:
@@ -68,19 +67,11 @@ def clips_of(folder: Path, cache: Path, most: int, only: list[str]) -> list[Clip
     return clips
 
 
-def video_images(path: Path) -> Iterator[tuple[float, Image]]:
-    """Images of a video with their seconds; NaN where it has no times."""
-    for shot in Video(path):
-        yield math.nan if shot.seconds is None else shot.seconds, shot.image
-
-
-def clip_of(
-    name: str, shots: Iterable[tuple[float, Image]], board: Chessboard, cache: Path, most: int
-) -> Clip:
-    """So many images, with their seconds, that show a board; corners are kept in ``cache``."""
-    file = cache / f"{name}_corners.npz"
+def _clip_of(path: Path, board: Chessboard, cache: Path, most: int) -> Clip:
+    """So many images of a video that show a board; corners are kept in ``cache``."""
+    file = cache / f"{path.stem}_corners.npz"
     if not file.exists():
-        _detect(shots, board, file)
+        _detect(path, board, file)
     stored = np.load(file)
     # x along the rows, y down, z away from the viewer: the first corner is the origin.
     points = (board.points - board.points[0]) @ np.diag([1.0, -1.0, -1.0])
@@ -90,15 +81,15 @@ def clip_of(
         for time, pixels in zip(times, stored["pixels"], strict=False)
     ]
     width, height = stored["size"].tolist()
-    return Clip(name, images, (width, height), float(np.median(np.diff(times))))
+    return Clip(path.stem, images, (width, height), float(np.median(np.diff(times))))
 
 
-def _detect(shots: Iterable[tuple[float, Image]], board: Chessboard, file: Path) -> None:
+def _detect(path: Path, board: Chessboard, file: Path) -> None:
     times, corners, shown, previous, size = [], [], [], None, (0, 0)
-    for time, image in shots:
-        size = image.shape[::-1]
-        pixels = find_chessboard(image, board, previous)
-        times.append(time)
+    for shot in Video(path):
+        size = shot.image.shape[::-1]
+        pixels = find_chessboard(shot.image, board, previous)
+        times.append(math.nan if shot.seconds is None else shot.seconds)
         if pixels is not None:
             shown.append(len(times) - 1)
             corners.append(pixels)
