@@ -27,7 +27,8 @@ from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.features.extraction import Features
 from rs_localizer.localizer import Localizer
 from rs_localizer.markers.families import family
-from rs_localizer.markers.maps import Marker, MarkerMap
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.markers.prints import Marker
 from rs_localizer.tools.mapping.anchors import Anchors
 from rs_localizer.tools.mapping.build import Built, Given, Workshop, built_from
 from rs_localizer.tools.mapping.gauge import scaled, through
@@ -322,6 +323,7 @@ def walks(seed: int) -> Iterator[str]:
         true, lies = room[built.kept], through(built.landmarks.points, room[built.kept])
         lies = scaled(1.0) if markers else lies
         off = np.linalg.norm(lies(built.landmarks.points) - true, axis=1)
+        assert built.landmarks.error_modes is not None
         modes = np.asarray(lies.scale * lies.rotation @ built.landmarks.error_modes)
         landmarks = ErrorModes(lies(built.landmarks.points), modes)
         shared = np.linalg.norm(modes, axis=(1, 2))
