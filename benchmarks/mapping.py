@@ -311,8 +311,8 @@ def walks(seed: int) -> Iterator[str]:
     COLMAP's part is left out: a first guess takes its place, whose landmarks are 2 cm off.
     """
     yield (
-        f"{'map build':28} landmarks  off (mm)  share (mm)  poses  error  claimed (mm)  "
-        "inside 95 %  > 5"
+        f"{'map build':22} landmarks  off (mm)  share (mm)  poses  error  claimed (mm)  "
+        "inside %  >5"
     )
     for name, (seconds, returns, markers) in _WALKS.items():
         rng = np.random.default_rng([seed, *name.encode()])
@@ -333,10 +333,10 @@ def walks(seed: int) -> Iterator[str]:
             found += _localized(film, true, lies(built.landmarks.points), landmarks, rng)
         error, claimed, squared = np.array(found).T
         yield (
-            f"{name:28} {len(true):9} {1e3 * np.median(off):9.1f} {1e3 * np.median(shared):11.1f} "
+            f"{name:22} {len(true):9} {1e3 * np.median(off):9.1f} {1e3 * np.median(shared):11.1f} "
             f"{len(found):6} {1e3 * np.median(error):6.1f} {1e3 * np.median(claimed):13.1f} "
-            f"{100.0 * np.mean(squared < chi2.ppf(0.95, 6)):12.0f} "
-            f"{np.count_nonzero(squared > _FIVE):4}"
+            f"{100.0 * np.mean(squared < chi2.ppf(0.95, 6)):9.0f} "
+            f"{np.count_nonzero(squared > _FIVE):3}"
         )
 
 
