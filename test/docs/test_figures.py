@@ -108,3 +108,13 @@ def test_the_table_of_what_is_noticed_is_what_its_bench_printed():
     for kind, published, beyond, _ in table.rows:
         said = list(zip(published.split(", "), beyond.split(", "), strict=True))
         assert said == printed[kind], kind
+
+
+def test_the_latency_in_readme_is_what_the_bench_of_the_node_printed():
+    said = " ".join(pages.text("README.md").split())
+    found = re.search(r"in (\d+) to (\d+) ms \(median; 99 %: (\d+) to (\d+) ms\)", said)
+    least, most, least_99, most_99 = map(int, found.groups())
+    printed = (RESULTS / "load.txt").read_text(encoding="utf-8")
+    median, p99 = map(float, re.search(r"p50 (\S+) ms, p99 (\S+) ms", printed).groups())
+    assert least <= round(median) <= most
+    assert least_99 <= round(p99) <= most_99
