@@ -97,7 +97,7 @@ def _innovation(estimate: Estimate, prior: Prior) -> float:
 
 
 def _keys(points: Array) -> Array:
-    """Return one number (n,) of each landmark's place (n,3)."""
+    """Return a key (n,) of each landmark, made of its place (n,3) in the map."""
     keys: Array = (points * _KEY).sum(axis=1)
     return keys
 

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Turn of the camera during the readout, as a gyroscope knows it.
+"""Rotation of the camera during the readout, as its gyroscope measured it.
 
 The body rate is a natural cubic spline through the samples (:mod:`rs_localizer.core.rate_spline`).
 Beside it, image points as a camera without that turn would see them (:func:`gyro_compensated`).
@@ -92,12 +92,12 @@ class GyroRotation:
 
     @property
     def spline(self) -> tuple[Array, Array, Array, Array]:
-        """Arguments of :func:`find_turn`."""
+        """The arguments of :func:`find_turn` behind the row time."""
         return self.tau, self.rates, self.rotations, self.parabola
 
     @property
     def numbers(self) -> Turning:
-        """Numbers as kernels take them."""
+        """The fields, as a :class:`Turning` that kernels take."""
         error = _UNKNOWN if self.rate_error is None else self.rate_error
         return Turning(*self.spline, self.rate, self.change, self.delay, self.rate_noise, error)
 
@@ -154,7 +154,7 @@ def _turn_at_rows(
 
 @entry
 def late_at(tau: float, times: Array1, cubics: Array3, parabola: Array2) -> tuple[Array, Array]:
-    """Turn (3,) and rate (3,) at a row time that a delay of one readout would leave.
+    """Return the rotation (3,) and rate (3,) that a delay of one readout leaves at a row time.
 
     The part that a constant acceleration can follow is left out: points determine it.
     """

@@ -338,7 +338,7 @@ class ByCamera(np.ndarray[Any, Any]):
         return split
 
     def like(self, values: Array) -> ByCamera:
-        """Return other values of the same points."""
+        """Return other values (n,) of the same points, split by camera as these are."""
         return ByCamera.of(values, self._places)
 
     def __array_finalize__(self, source: Any) -> None:

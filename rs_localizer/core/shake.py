@@ -1,10 +1,11 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""In-frame rotation of the camera beside a motion of constant acceleration.
+"""In-frame rotation: vibration of the camera beside its motion of constant acceleration.
 
-A sum of cosines and sines of the row time at fixed frequencies, half a cycle per readout apart:
-vibration of any spectrum, as a Gaussian process in row time. Value and slope at the middle row are
-taken away, so that pose and velocities there are the motion's own.
+The rotation vector (rad) is a sum of cosines and sines of the row time ``tau`` (-0.5 to 0.5). Their
+frequencies are fixed, half a cycle per readout apart. With Gaussian coefficients the sum is a
+Gaussian process in row time, which can have any spectrum. Each function has its value and its slope
+at ``tau`` = 0 subtracted, so that pose and velocities of the middle row belong to the motion alone.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def shake_basis(tau: float, values: Out[Array1], rates: Out[Array1]) -> None:
 
 @entry
 def shake_at(tau: Array1, coefficients: Array2) -> Array:
-    """Turn of the camera beside its motion, and its rate, (n,6) at row times (n,).
+    """Return in-frame rotations (rad) and their rates, (n,6), at row times (n,).
 
     ``coefficients`` (k,3) rad, of :func:`shake_basis`; none: the camera does not shake.
     """

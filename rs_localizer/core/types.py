@@ -103,10 +103,10 @@ class Estimate(Motion):
         return math.sqrt(np.linalg.eigvalsh(self.covariance[TURN, TURN])[-1])
 
     def shake_at(self, tau: float) -> tuple[Array, Array]:
-        """Turn (3,) of the camera beside the motion, and its rate (3,), at row time ``tau``.
+        """Return the in-frame rotation (3,), rad, and its rate (3,), per readout, at ``tau``.
 
         The rows say nothing of the time before the first and after the last one, where polynomials
-        would run away: there the turn stays as it was.
+        would run away: there the rotation stays as it was.
         """
         turn = shake_at(np.array([within_rows(tau)]), self.shake)[0]
         return turn[:3], turn[3:] if tau == within_rows(tau) else np.zeros(3)
@@ -125,7 +125,7 @@ class Estimate(Motion):
         )
 
     def turned_beside(self, tau: float) -> Array:
-        """Return the rotation (3,3) by which the camera is turned beside that motion at ``tau``."""
+        """Return the rotation (3,3) at ``tau`` beside the motion, by gyroscope and vibration."""
         shaken = so3.exp(-self.shake_at(tau)[0])
         return shaken if self.turn is None else self.turn.at(tau)[0] @ shaken
 
