@@ -3,7 +3,8 @@
 """Rotation of the camera during the readout, as its gyroscope measured it.
 
 The body rate is a natural cubic spline through the samples (:mod:`rs_localizer.core.rate_spline`).
-Beside it, image points as a camera without that turn would see them (:func:`gyro_compensated`).
+It also maps image points to where a camera without that rotation would see them
+(:func:`gyro_compensated`).
 """
 
 from __future__ import annotations
@@ -45,14 +46,13 @@ class GyroRotation:
     change: Array
     # (3,3) the parabola, in powers of tau, that is nearest to the rate over the readout
     parabola: Array
-    roughness: float  # rad per readout, root mean square of what the parabola leaves
-    # (6,6) of what the gyroscope is off by: a constant rate and its change, rad per readout and
-    # per readout squared, along the axes at tau = 0
+    roughness: float  # rad per readout, root mean square of the rate minus the parabola
+    # (6,6) covariance of the gyroscope's errors: a constant rate (rad per readout) and its change
+    # (per readout squared), in the axes at tau = 0
     error: Array = field(default_factory=lambda: np.zeros((6, 6)))
-    rate_noise: float = 0.0  # rad per readout, of the rate at one moment
-    delay: float = 0.0  # by how many readouts (standard deviation) all of it may be late or early
-    # (3,3) of the rate at any moment, but for what a delay and the noise of one moment make of it,
-    # (rad per readout)^2; None: it is not known beside what ``error`` says
+    rate_noise: float = 0.0  # rad per readout, white noise of the rate
+    delay: float = 0.0  # readouts, standard deviation of the stamps' common offset
+    # (3,3) covariance of the rate without delay and noise, (rad per readout)^2; None: unknown
     rate_error: Array | None = None
 
     @classmethod
@@ -120,7 +120,7 @@ NO_TURN = Turning(
     np.array([-0.5, 0.5]), np.zeros((1, 4, 3)), np.stack([np.eye(3)] * 2), np.zeros((3, 3)),
     np.zeros(3), np.zeros(3), 0.0, 0.0, _UNKNOWN,
 )  # fmt: skip
-"""Of a camera beside which there is no gyroscope."""
+"""The rotation of a camera without a gyroscope: none."""
 
 
 @kernel
@@ -200,7 +200,7 @@ def turn_of(tau: Array1, rates: Array2) -> tuple[Array, Array, Array, Array, Arr
 
 # Image points that nearly keep pace with the rows.
 _LEAST_PACE = 0.1
-# Bearings that the turn takes out of the camera's front have no place in its image.
+# Bearings that the rotation moves behind the image plane have no image point.
 _LEAST_FRONT = 1e-3
 
 

@@ -16,8 +16,8 @@ from rs_localizer.core.arrays import Array, Array1, Array2, Out
 from rs_localizer.native import entry
 
 CYCLES = 0.5 * np.arange(1.0, 15.0)
-"""Cycles per readout. With a readout of 30 ms up to 233 Hz; half a cycle apart is what a window of
-one readout resolves (twice the Rayleigh spacing of cosine and sine together)."""
+"""Cycles per readout: up to 233 Hz with a readout of 30 ms. A window of one readout resolves
+frequencies that are half a cycle apart."""
 FUNCTIONS = 2 * len(CYCLES)
 RATES = 2.0 * np.pi * CYCLES
 """rad per unit of row time."""
@@ -25,10 +25,10 @@ RATES = 2.0 * np.pi * CYCLES
 MIDDLE_VALUES, MIDDLE_RATES = np.zeros(FUNCTIONS), np.zeros(FUNCTIONS)
 MIDDLE_VALUES[::2], MIDDLE_RATES[1::2] = 1.0, RATES
 TYPICAL_SIZES = 3e-4 / np.sqrt(CYCLES)
-"""rad, of an ordinary vibration: 0.02 deg at a cycle per readout, less the faster."""
+"""rad, amplitudes of an ordinary vibration: 0.02 deg at one cycle per readout, less if faster."""
 RESOLVED = 18
-"""Combinations of whole cosines and sines that one readout tells from each other: all others are
-smaller than 1e-4 of their squares, and turn the middle row as little."""
+"""Combinations of cosines and sines that one readout tells from each other. The squares of all
+others are below 1e-4 of the largest, and they rotate the middle row as little."""
 
 
 def _resolved() -> tuple[Array, Array]:
