@@ -56,6 +56,30 @@ def test_every_figure_of_the_rest_is_in_the_file_that_it_links_to(item):
     assert {number for number in NUMBER.findall(figures) if number not in known} == set()
 
 
+LINKED = [
+    (page, " ".join(said.split()))
+    for page in pages.NAMES
+    if page.startswith("docs/") and page != "docs/benchmarks.md"
+    for said in re.split(r"(?<=[.;:])\s+|\n\n|\n\* ", pages.prose(page))
+    if "](benchmarks.md#" in said
+]
+
+
+@pytest.mark.parametrize(("page", "said"), LINKED)
+def test_figures_of_a_sentence_are_in_the_tables_that_it_links_to(page, said):
+    anchor = re.search(r"\]\(benchmarks\.md#([\w-]+)\)", said)[1]
+    part = section(anchor)
+    printed = [*blocks(part).values()]
+    linked = re.findall(r"\]\(\.\./benchmarks/results/([\w-]+)\.txt\)", part)
+    printed += [(RESULTS / f"{name}.txt").read_text(encoding="utf-8") for name in linked]
+    known = [float(number) for text in printed for number in NUMBER.findall(text)]
+    figures = re.sub(r"`[^`]*`|\]\([^)]*\)", "", said)
+    for number in NUMBER.findall(figures):
+        digits = len(number.partition(".")[2])
+        near = {round(x, digits) for value in known for x in (value, 100.0 * value)}
+        assert float(number) in near, (page, number)
+
+
 def test_the_picture_of_errors_is_of_the_run_whose_medians_are_printed():
     rows = (RESULTS / "demo.txt").read_text(encoding="utf-8").splitlines()
     columns = rows[0].split()[1:]
