@@ -25,7 +25,7 @@ PAGES = {
     "Start": "concepts install phone camera common_cameras cameras/index",
     "Use": "node robot reasons wrong_poses detector features imu rigs recordings calibration "
     "mapping map_build maps simulation integrations examples library policy build_farm",
-    "Understand": "limits solvers estimator honesty benchmarks architecture api",
+    "Understand": "limits solvers estimator benchmarks architecture api",
 }
 OTHERS = (
     *("CONTRIBUTING", "CODE_OF_CONDUCT", "SECURITY", "benchmarks/README"),

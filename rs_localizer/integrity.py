@@ -5,14 +5,14 @@
 A wrong pose leaves traces in a frame: outliers cluster, and are the same landmarks in the next
 frame; inliers fill only a part of the view. Each trace is a number, and a logistic regression turns
 them into log odds. It was fitted to sequences in right and wrong maps (``python -m
-benchmarks.integrity --fit``), and is tempered because successive frames err together. If a whole
-map is wrong in the same way, only the moment at which it begins is visible: the pose lies where the
+benchmarks.integrity --fit``). Its odds are tempered, because successive frames err together. If a
+whole map is wrong in the same way, only the first wrong frame shows it: its pose lies where the
 frames before did not predict it. A hidden Markov chain combines both. Its states are: right; wrong,
 and frames show it; wrong since a jump.
 
-No image shows that a room had been moved as a whole before the first frame; or that a wall is a
-copy of another one while nothing else is in view. Landmarks that are gone do not make a pose wrong;
-:attr:`Integrity.stale` names them.
+No image can show that a room was moved as a whole before the first frame. Neither can an image of
+one wall show that the wall is a copy of another one. Landmarks that have disappeared do not make a
+pose wrong; :meth:`Integrity.stale` finds them.
 """
 
 import math
@@ -29,7 +29,7 @@ from rs_localizer.native import entry
 
 NAMES = ("apart", "persists", "spread", "filled", "count", "innovation")
 """Names of the numbers of a frame."""
-# Of the regression: the constant, then the weights of NAMES; the innovation counts as a jump only.
+# The regression: the constant, then the weights of NAMES; an innovation counts as a jump only.
 WEIGHTS = np.array([1.267, 0.426, -0.083, -3.532, 0.453, -0.374, 0.0])
 # Weight of a frame's log odds beside those of earlier frames; probabilities per frame that a right
 # track goes wrong and that a wrong one recovers; probabilities that a first pose is wrong in either
@@ -41,12 +41,12 @@ TEMPER, GOES_WRONG, RECOVERS, FIRST = 0.5, 0.001, 0.5, (0.015, 0.005)
 # of which a part is right has jumps to right poses.
 JUMP, MOST_JUMP = (-16.57, 5.58), 0.52
 INNOVATION = NAMES.index("innovation")
-# Neighbours of a point in the map, and how many points are looked at.
+# Neighbours of a point in the map that are compared with it; most points that are compared.
 _NEIGHBOURS, _MOST = 4, 200
-# Turns the position of a landmark into one number, which no other position shares to the last bit.
+# Weights that make one number of a landmark's position, which no other position shares.
 _KEY = np.sqrt([2.0, 3.0, 5.0])
-# A landmark counts as gone if one that is there would be missed as often with this probability; the
-# most landmarks that are remembered.
+# A landmark has disappeared if an existing one would be missed as often with less than this
+# probability. Most landmarks that are remembered.
 _BY_CHANCE, _MOST_LANDMARKS = 1e-8, 20_000
 # Bound of a frame's log odds.
 _MOST_ODDS = 8.0
@@ -97,7 +97,7 @@ def _innovation(estimate: Estimate, prior: Prior) -> float:
 
 
 def _keys(points: Array) -> Array:
-    """Return one number (n,) of each landmark's place (n,3)."""
+    """Return a key (n,) of each landmark, made of its place (n,3) in the map."""
     keys: Array = (points * _KEY).sum(axis=1)
     return keys
 
@@ -142,8 +142,8 @@ class Integrity:
         self.reset()
 
     def reset(self) -> None:
-        """Start anew with the next frame; landmarks stay what they are."""
-        # Of the three states, after the last frame.
+        """Start anew with the next frame; the counts of landmarks are kept."""
+        # Probabilities of the three states after the last frame.
         self._chances = np.array([1.0 - sum(FIRST), *FIRST])
         self._is_first = True
         # Keys of the last frame's landmarks, in their order, and whether they were inliers
@@ -160,7 +160,7 @@ class Integrity:
 
         Args:
             estimate: of the frame.
-            points, pixels: (n,3) m and (n,2) px that it was found by.
+            points, pixels: (n,3) m and (n,2) px of its correspondences.
             prior: what the frames before predicted; None: nothing.
         """
         residuals = np.asarray(estimate.residuals)
@@ -173,7 +173,7 @@ class Integrity:
         outliers = (len(kept) - inliers + 1.0) / (len(kept) + 2.0)
         return np.array(
             [
-                _together(every, kept) * outliers,  # of few outliers, as of a person, less
+                _together(every, kept) * outliers,  # less, if few cluster: a person in view
                 self._persists(every, kept),
                 _spread(seen[kept], seen),
                 filled,
@@ -183,9 +183,9 @@ class Integrity:
         )
 
     def _persists(self, points: Array, kept: BoolArray) -> float:
-        """Return the log odds that landmarks are what they were in the last frame, against chance.
+        """Return the log odds, over chance, that landmarks keep being inliers or outliers.
 
-        Chance matches are others in each frame; landmarks that have been moved are always off.
+        Chance mismatches differ from frame to frame; a landmark that was moved stays an outlier.
         """
         keys = _keys(points)
         self._seen.add(keys, kept)
@@ -199,7 +199,7 @@ class Integrity:
         return float(np.log(counts[0, 0] * counts[1, 1] / (counts[0, 1] * counts[1, 0])))
 
     def add(self, numbers: Array) -> float:
-        """Return the probability after a frame of these numbers."""
+        """Return the probability that the pose is wrong, after a frame with these numbers (6,)."""
         said = min(max(float(WEIGHTS[0] + WEIGHTS[1:] @ numbers), -_MOST_ODDS), _MOST_ODDS)
         if not self._is_first:
             self._chances = _transitions(float(numbers[INNOVATION])) @ self._chances

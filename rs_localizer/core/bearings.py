@@ -71,7 +71,7 @@ def pinhole(camera: Camera) -> tuple[Array, Array, Array] | None:
 
 
 def _image(x: Lanes, y: Lanes, lens: Vector) -> Vector:
-    """Return where the lens shows a bearing, from the centre in focal lengths; derivatives (4)."""
+    """Return the image (2 values) of a bearing, focal lengths from the centre; derivatives (4)."""
     k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = lens
     square = x * x + y * y
     above = 1.0 + square * (k1 + square * (k2 + square * k3))

@@ -1,9 +1,10 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Turn of the camera during the readout, as a gyroscope knows it.
+"""Rotation of the camera during the readout, as its gyroscope measured it.
 
 The body rate is a natural cubic spline through the samples (:mod:`rs_localizer.core.rate_spline`).
-Beside it, image points as a camera without that turn would see them (:func:`gyro_compensated`).
+It also maps image points to where a camera without that rotation would see them
+(:func:`gyro_compensated`).
 """
 
 from __future__ import annotations
@@ -45,14 +46,13 @@ class GyroRotation:
     change: Array
     # (3,3) the parabola, in powers of tau, that is nearest to the rate over the readout
     parabola: Array
-    roughness: float  # rad per readout, root mean square of what the parabola leaves
-    # (6,6) of what the gyroscope is off by: a constant rate and its change, rad per readout and
-    # per readout squared, along the axes at tau = 0
+    roughness: float  # rad per readout, root mean square of the rate minus the parabola
+    # (6,6) covariance of the gyroscope's errors: a constant rate (rad per readout) and its change
+    # (per readout squared), in the axes at tau = 0
     error: Array = field(default_factory=lambda: np.zeros((6, 6)))
-    rate_noise: float = 0.0  # rad per readout, of the rate at one moment
-    delay: float = 0.0  # by how many readouts (standard deviation) all of it may be late or early
-    # (3,3) of the rate at any moment, but for what a delay and the noise of one moment make of it,
-    # (rad per readout)^2; None: it is not known beside what ``error`` says
+    rate_noise: float = 0.0  # rad per readout, white noise of the rate
+    delay: float = 0.0  # readouts, standard deviation of the stamps' common offset
+    # (3,3) covariance of the rate without delay and noise, (rad per readout)^2; None: unknown
     rate_error: Array | None = None
 
     @classmethod
@@ -92,12 +92,12 @@ class GyroRotation:
 
     @property
     def spline(self) -> tuple[Array, Array, Array, Array]:
-        """Arguments of :func:`find_turn`."""
+        """The arguments of :func:`find_turn` behind the row time."""
         return self.tau, self.rates, self.rotations, self.parabola
 
     @property
     def numbers(self) -> Turning:
-        """Numbers as kernels take them."""
+        """The fields, as a :class:`Turning` that kernels take."""
         error = _UNKNOWN if self.rate_error is None else self.rate_error
         return Turning(*self.spline, self.rate, self.change, self.delay, self.rate_noise, error)
 
@@ -120,7 +120,7 @@ NO_TURN = Turning(
     np.array([-0.5, 0.5]), np.zeros((1, 4, 3)), np.stack([np.eye(3)] * 2), np.zeros((3, 3)),
     np.zeros(3), np.zeros(3), 0.0, 0.0, _UNKNOWN,
 )  # fmt: skip
-"""Of a camera beside which there is no gyroscope."""
+"""The rotation of a camera without a gyroscope: none."""
 
 
 @kernel
@@ -154,7 +154,7 @@ def _turn_at_rows(
 
 @entry
 def late_at(tau: float, times: Array1, cubics: Array3, parabola: Array2) -> tuple[Array, Array]:
-    """Turn (3,) and rate (3,) at a row time that a delay of one readout would leave.
+    """Return the rotation (3,) and rate (3,) that a delay of one readout leaves at a row time.
 
     The part that a constant acceleration can follow is left out: points determine it.
     """
@@ -200,7 +200,7 @@ def turn_of(tau: Array1, rates: Array2) -> tuple[Array, Array, Array, Array, Arr
 
 # Image points that nearly keep pace with the rows.
 _LEAST_PACE = 0.1
-# Bearings that the turn takes out of the camera's front have no place in its image.
+# Bearings that the rotation moves behind the image plane have no image point.
 _LEAST_FRONT = 1e-3
 
 

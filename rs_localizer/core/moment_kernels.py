@@ -140,7 +140,7 @@ def _better_known(turn: Turning, tau: float, covariance: Array) -> bool:
 
 @kernel
 def _shaken(shake: Array, tau: float, count: int) -> tuple[Array, Array, Array, Array]:
-    """Return polynomials at a row time, their rates, the rotation (3,) they make, and its rate.
+    """Return the functions of vibration at a row time, their rates, the rotation (3,), its rate.
 
     Before the first and after the last row the camera stays as it was.
     """

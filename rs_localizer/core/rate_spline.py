@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Turns of a camera whose body rate is a natural cubic spline through samples.
+"""Rotations of a camera whose body rate is a natural cubic spline through samples.
 
 Between two samples the camera turns by ``exp(-theta)``, with Magnus' series up to its second term
 (Blanes, Casas, Oteo, Ros, "The Magnus expansion and some of its applications", 2009):

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rigs: several cameras that move as one, each with a shutter and a clock of its own.
 
-A camera ``k`` of a rig sees, in a row that is exposed at ``t``, what lies at
+In a row that is exposed at ``t``, camera ``k`` of a rig sees a point of the map at
 
     X_camera = R_k (rig_from_map(t) X_map) + p_k
 
-so that the rig's turn carries each camera along by its lever arm. A camera alone is the rig of one
-with ``R = I`` and ``p = 0``.
+When the rig rotates, ``p_k`` is the lever arm that moves the camera. A single camera is a rig with
+``R = I`` and ``p = 0``.
 """
 
 from __future__ import annotations
@@ -27,8 +27,7 @@ from rs_localizer.core.types import Estimate
 
 # Entries of R R^T - I beyond this are no rounding of a calibration file's digits.
 _ORTHONORMAL = 1e-3
-# s; clocks of one rig that are farther apart are not of one frame, and a motion that is smooth over
-# a frame is none over that.
+# s; exposures that are farther apart are not one frame: no motion stays smooth for so long.
 _LONGEST_SPAN = 2.0
 
 Extrinsics = tuple[Any, Any]
@@ -47,15 +46,15 @@ class Rig:
         time_offset: s to add to the stamps of a camera; absent: 0.
 
     Raises:
-        ValueError: a name is unknown or missing, a rotation is none, a value is not finite, or one
-            of several cameras has no readout time.
+        ValueError: a name is unknown or missing, a matrix is no rotation, a value is not finite, or
+            one of several cameras has no readout time.
     """
 
     cameras: Mapping[str, Camera]
     camera_from_rig: Mapping[str, tuple[Array, Array]]
     time_offset: Mapping[str, float] = field(default_factory=dict)
 
-    if TYPE_CHECKING:  # what may be given; the fields say what it becomes
+    if TYPE_CHECKING:  # the types that callers may pass; the fields have the types that are kept
 
         def __init__(
             self,
@@ -94,7 +93,7 @@ class Rig:
         set_field(self, "camera_from_rig", MappingProxyType(extrinsics))
         set_field(self, "time_offset", MappingProxyType(offsets))
 
-    def __reduce__(self) -> tuple[Any, ...]:  # no pickle holds mappings that cannot be changed
+    def __reduce__(self) -> tuple[Any, ...]:  # a MappingProxyType cannot be pickled
         return Rig, (dict(self.cameras), dict(self.camera_from_rig), dict(self.time_offset))
 
     @classmethod
@@ -132,7 +131,7 @@ class Rig:
         starts = np.array([_seconds(name, given[name]) for name in chosen])
         offsets = np.array([self.time_offset[name] for name in chosen])
         rows = np.array([camera.first_row_time for camera in cameras])
-        # Relative to the first one: stamps of a clock since 1970 have no digits to lose.
+        # Relative to the first one, because seconds since 1970 use up a double's digits.
         middles = (starts - starts[0]) + offsets - rows * readouts
         reference = middles[0]
         middles -= reference
@@ -217,8 +216,8 @@ def _sides_of(camera: Camera) -> tuple[Array | None, ...]:
 class Side(NamedTuple):
     """View of a camera about one axis, as a camera of its own that looks there.
 
-    Rays ``x/z, y/z`` end at 90 degrees from the axis, and long before that a pixel is many of them
-    wide. A lens that sees more is six cameras at one place, each with less than 55 degrees.
+    Rays ``x/z, y/z`` are infinite at 90 degrees from the axis. So a lens that sees behind its image
+    plane is treated as six cameras at one place, each of which sees less than 55 degrees.
     """
 
     camera: Camera
@@ -230,7 +229,7 @@ class Side(NamedTuple):
         return camera_from_rig if self.axes is None else self.axes @ camera_from_rig
 
     def towards(self, rays: Array) -> Array:
-        """Return bearings (n,3), in camera axes, of rays (n,2) of this side; of all, the rays."""
+        """Return bearings (n,3), camera axes, of rays (n,2); the rays, if this side sees all."""
         if self.axes is None:
             return rays
         towards: Array = np.column_stack([rays, np.ones(len(rays))]) @ self.axes
@@ -261,7 +260,7 @@ class Mounts(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exposure:
-    """Times at which, and places from where, the k cameras of one frame see it.
+    """Times at which the k cameras of a frame are exposed, and their places on the rig.
 
     Row times of a frame are counted from the middle of all exposures, in the span from the first
     exposed row of any camera to the last one: from -0.5 to 0.5.
@@ -285,7 +284,7 @@ class Exposure:
         """Return the exposure of a single camera that sees only what lies before its image plane.
 
         Args:
-            pixels: (n,2) raw; where some show more than that, the exposure is as it was.
+            pixels: (n,2) raw; if one of them shows more than that, the exposure is unchanged.
         """
         if len(self.sides) == 1:
             return self
@@ -297,7 +296,8 @@ class Exposure:
     def look(self, place: int, pixels: Array) -> tuple[Array, Array, IntArray]:
         """Return rays (n,2) of a camera's raw pixels (n,2), their derivatives, and their sides.
 
-        NaN where it has none; (n,2,2) of the pixels by the rays; (n,) of which side they are.
+        Rays are NaN if a pixel has none. The derivatives (n,2,2) are of the pixels by the rays.
+        The sides (n,) are places in ``sides``.
         """
         if len(self.sides) == len(self.cameras):  # one for each
             return *bearings(self.cameras[place], pixels), np.full(len(pixels), place)
@@ -326,7 +326,7 @@ class Exposure:
 
 
 class ByCamera(np.ndarray[Any, Any]):
-    """Values of all points of a frame, of one camera by its name: ``values["front"]``."""
+    """Values of all points of a frame; ``values["front"]`` are those of one camera."""
 
     _places: Mapping[str, slice]
 
@@ -338,13 +338,13 @@ class ByCamera(np.ndarray[Any, Any]):
         return split
 
     def like(self, values: Array) -> ByCamera:
-        """Return other values of the same points."""
+        """Return other values (n,) of the same points, split by camera as these are."""
         return ByCamera.of(values, self._places)
 
     def __array_finalize__(self, source: Any) -> None:
         self._places = getattr(source, "_places", {})
 
-    def __reduce__(self) -> tuple[Any, ...]:  # pickling an array forgets what it has besides
+    def __reduce__(self) -> tuple[Any, ...]:  # pickling an array drops its attributes
         return ByCamera.of, (np.array(self), self._places)
 
     def __deepcopy__(self, memo: object) -> ByCamera:
@@ -382,7 +382,7 @@ class RigEstimate(Estimate):
 
     def at_time(self, time: float) -> RigEstimate:
         """Return the motion at a time (s, clock of the stamps), with its covariance then."""
-        # Not by super(): a dataclass with slots is made anew.
+        # By the class: super() fails in a dataclass with slots.
         moved = Estimate.at_time(self, time - self.time)
         assert isinstance(moved, RigEstimate)
         return replace(moved, time=time)

@@ -1,10 +1,11 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""In-frame rotation of the camera beside a motion of constant acceleration.
+"""In-frame rotation: vibration of the camera beside its motion of constant acceleration.
 
-A sum of cosines and sines of the row time at fixed frequencies, half a cycle per readout apart:
-vibration of any spectrum, as a Gaussian process in row time. Value and slope at the middle row are
-taken away, so that pose and velocities there are the motion's own.
+The rotation vector (rad) is a sum of cosines and sines of the row time ``tau`` (-0.5 to 0.5). Their
+frequencies are fixed, half a cycle per readout apart. With Gaussian coefficients the sum is a
+Gaussian process in row time, which can have any spectrum. Each function has its value and its slope
+at ``tau`` = 0 subtracted, so that pose and velocities of the middle row belong to the motion alone.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from rs_localizer.core.arrays import Array, Array1, Array2, Out
 from rs_localizer.native import entry
 
 CYCLES = 0.5 * np.arange(1.0, 15.0)
-"""Cycles per readout. With a readout of 30 ms up to 233 Hz; half a cycle apart is what a window of
-one readout resolves (twice the Rayleigh spacing of cosine and sine together)."""
+"""Cycles per readout: up to 233 Hz with a readout of 30 ms. A window of one readout resolves
+frequencies that are half a cycle apart."""
 FUNCTIONS = 2 * len(CYCLES)
 RATES = 2.0 * np.pi * CYCLES
 """rad per unit of row time."""
@@ -24,10 +25,10 @@ RATES = 2.0 * np.pi * CYCLES
 MIDDLE_VALUES, MIDDLE_RATES = np.zeros(FUNCTIONS), np.zeros(FUNCTIONS)
 MIDDLE_VALUES[::2], MIDDLE_RATES[1::2] = 1.0, RATES
 TYPICAL_SIZES = 3e-4 / np.sqrt(CYCLES)
-"""rad, of an ordinary vibration: 0.02 deg at a cycle per readout, less the faster."""
+"""rad, amplitudes of an ordinary vibration: 0.02 deg at one cycle per readout, less if faster."""
 RESOLVED = 18
-"""Combinations of whole cosines and sines that one readout tells from each other: all others are
-smaller than 1e-4 of their squares, and turn the middle row as little."""
+"""Combinations of cosines and sines that one readout tells from each other. The squares of all
+others are below 1e-4 of the largest, and they rotate the middle row as little."""
 
 
 def _resolved() -> tuple[Array, Array]:
@@ -63,7 +64,7 @@ def shake_basis(tau: float, values: Out[Array1], rates: Out[Array1]) -> None:
 
 @entry
 def shake_at(tau: Array1, coefficients: Array2) -> Array:
-    """Turn of the camera beside its motion, and its rate, (n,6) at row times (n,).
+    """Return in-frame rotations (rad) and their rates, (n,6), at row times (n,).
 
     ``coefficients`` (k,3) rad, of :func:`shake_basis`; none: the camera does not shake.
     """

@@ -59,7 +59,7 @@ class Motion:
         return _at_rows(numbers_of(self), np.ascontiguousarray(tau, np.float64))
 
     def angle_at(self, tau: Any) -> Array:
-        """Return the rotation vector (3,) of the turn from the middle row to ``tau``."""
+        """Return the rotation vector (3,), rad, from the middle row to ``tau``."""
         angle: Array = tau * self.angular_velocity + 0.5 * tau * tau * self.angular_acceleration
         return angle
 

@@ -19,7 +19,7 @@ from rs_localizer.core.shutter import Motion, carried, numbers_of
 from rs_localizer.core.state import ANGULAR, MOTION_PARAMETERS, PARAMETERS, TURN
 from rs_localizer.native import entry
 
-# Readouts within which accelerations fade by exp(-1): they stay what they are.
+# Readouts within which accelerations fade by exp(-1): here they do not fade.
 _NO_FADING = 1e9
 
 # Row times at which the rate of the vibration is sampled.
@@ -32,43 +32,44 @@ _LAST_ROW = 0.55
 class Estimate(Motion):
     """An accepted pose and velocity; true in a condition.
 
-    ``covariance`` has 12 rows: rotation (the camera rotates by exp of it, in its own axes), camera
-    position in camera axes, angular velocity, linear velocity, in the units of the fields.
-    Accelerations and vibration are averaged out of it. ``joint_covariance`` has them at its end, in
-    the order of ``rs_localizer.core.state`` and of ``shake``. ``covariance`` includes the errors of
-    the calibration, which are the same in all frames, and errors of this frame alone, as of hidden
-    vibration. ``joint_covariance`` goes on to the next frame. With ``refinement`` none all of them
-    are NaN.
+    ``covariance`` (12,12) is published. Its rows are a rotation vector in camera axes, the camera
+    position in camera axes, angular velocity and linear velocity, in the units of the fields. It is
+    marginal over accelerations and vibration. It includes errors of the calibration, which all
+    frames share, and errors of this frame alone, such as hidden vibration.
+
+    ``joint_covariance`` is what a tracker takes to the next frame. Its further rows are the
+    accelerations (:mod:`rs_localizer.core.state`) and the coefficients of ``shake``. If
+    ``refinement`` is ``none``, all covariances are NaN.
     """
 
     inliers: BoolArray  # (n,)
     residuals: Array  # (n,) reprojection error in raw pixels, NaN where a point was unusable
     joint_covariance: Array  # (18 + 3 k, 18 + 3 k)
     iterations: int  # minimal samples drawn
-    # (12,12) of what calibration and declared map may be off, a part of ``covariance``
+    # (12,12) part of ``covariance`` that errors of calibration and declared map cause
     calibration_covariance: Array = field(
         default_factory=np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)).copy
     )
-    # (12,12) of vibration that hides in the noise of this frame, which is an estimate, and of arcs
-    # about what is seen, which leave their tangents; likewise
+    # (12,12) part of ``covariance`` that vibration below the noise causes, and the curvature of
+    # arcs about the scene on which the camera may lie
     undetected_covariance: Array = field(
         default_factory=np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)).copy
     )
     still_deviation: float = math.inf  # rad, orientation_deviation if the motion were known
-    # (k,3) rad: what the camera turns beside the motion (rs_localizer.core.shake): vibration
+    # (k,3) rad: coefficients of the in-frame rotation, vibration (rs_localizer.core.shake)
     shake: Array = field(default_factory=np.zeros((0, 3)).copy)
-    # (s,f) logarithms of the evidence of each vibration by this frame, against none; empty: unknown
+    # (s,f) log evidence of each size and spectrum of vibration over none; empty: unknown
     vibrations: Array = field(default_factory=np.zeros((0, 0)).copy)
-    model_error: float = 0.0  # px, rms of what map, lens and motion leave beside the noise
-    declared_error: float = 0.0  # px, what map and calibration are declared to leave of it
+    model_error: float = 0.0  # px, rms error of map, lens and motion beside the noise
+    declared_error: float = 0.0  # px, the part of it that map and calibration are declared to have
     tracked: bool = False  # found near a prior motion, without a search
     time_ns: int = 0  # of a tracker: when the middle row was exposed
     # Rotation of the camera by a gyroscope; velocities and accelerations include it
     turn: GyroRotation | None = None
-    span: float = 0.0  # s of a readout, as which row times count; 0: unknown
+    span: float = 0.0  # s, duration of one unit of row time; 0: unknown
     # Probability that the pose lies outside its region or the map is another one; NaN: not judged
     integrity: float = math.nan
-    # The velocities are the camera's, and not a mean of what may rest and what may move
+    # False: the image does not tell rest from motion, and the velocities are a mean of both
     twist_known: bool = True
     left_out: str = ""  # what is odd about the points that are no inliers, one sentence
 
@@ -81,8 +82,8 @@ class Estimate(Motion):
     def with_joint_covariance(self, joint_covariance: Array, **fields: Any) -> Self:
         """Return the estimate with a covariance that other frames have determined.
 
-        What arcs take from the old covariance, by what it ties to them, the new one may not have:
-        of what is beside it stays what widens any.
+        Arcs may narrow the old covariance by its correlations, which the new one may lack. So only
+        the positive part of ``undetected_covariance`` is kept.
         """
         variances = np.diag(self.joint_covariance)[:MOTION_PARAMETERS]
         known = (variances > 0.0) & (variances < np.inf)
@@ -103,10 +104,10 @@ class Estimate(Motion):
         return math.sqrt(np.linalg.eigvalsh(self.covariance[TURN, TURN])[-1])
 
     def shake_at(self, tau: float) -> tuple[Array, Array]:
-        """Turn (3,) of the camera beside the motion, and its rate (3,), at row time ``tau``.
+        """Return the in-frame rotation (3,), rad, and its rate (3,), per readout, at ``tau``.
 
-        The rows say nothing of the time before the first and after the last one, where polynomials
-        would run away: there the turn stays as it was.
+        No row shows the time before the first row or after the last one: there the rotation keeps
+        the value of that row.
         """
         turn = shake_at(np.array([within_rows(tau)]), self.shake)[0]
         return turn[:3], turn[3:] if tau == within_rows(tau) else np.zeros(3)
@@ -125,7 +126,7 @@ class Estimate(Motion):
         )
 
     def turned_beside(self, tau: float) -> Array:
-        """Return the rotation (3,3) by which the camera is turned beside that motion at ``tau``."""
+        """Return the rotation (3,3) at ``tau`` beside the motion, by gyroscope and vibration."""
         shaken = so3.exp(-self.shake_at(tau)[0])
         return shaken if self.turn is None else self.turn.at(tau)[0] @ shaken
 
@@ -144,7 +145,7 @@ class Estimate(Motion):
         return self._at(tau)
 
     def _at(self, tau: float) -> tuple[Array, Array]:
-        # Not by the object itself: a dataclass with slots is made anew, and this is overridden.
+        # By the class: super() fails in a dataclass with slots, and self.at is overridden.
         rotation, translation = Motion.at(self.without_gyro(), tau)
         turned = self.turned_beside(tau)
         return turned @ rotation, turned @ translation
@@ -180,8 +181,7 @@ class Estimate(Motion):
     def at_time(self, seconds: float) -> Estimate:
         """Return the motion this many seconds after its middle row, with its covariance then.
 
-        Within the rows it is the frame's own; beyond them it goes on under the acceleration that
-        it had, of which the covariance knows how uncertain it is.
+        Beyond the rows the acceleration is constant, and its uncertainty enters the covariance.
 
         Raises:
             ValueError: where the readout time is unknown.
@@ -200,14 +200,14 @@ class Estimate(Motion):
             own = slice(PARAMETERS + 3 * k, PARAMETERS + 3 * k + 3)
             transport[TURN, own] = values[k] * np.eye(3)
             transport[ANGULAR, own] = rates[k] * np.eye(3) if tau == within_rows(tau) else 0.0
-        turned = self.turned_beside(tau)  # the axes of then
+        turned = self.turned_beside(tau)  # camera axes at ``tau``
         for k in range(0, PARAMETERS, 3):
             transport[k : k + 3] = turned @ transport[k : k + 3]
         shared = transport[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
         joint = transport @ self.joint_covariance @ transport.T
         for part, variance in zip((TURN, ANGULAR), beyond_rows(self, tau), strict=True):
             joint[part, part] += variance * np.eye(3)
-        if self.turn is not None:  # what its errors and its noise are at one moment
+        if self.turn is not None:  # its delay and its noise at this moment
             late = late_at(tau, self.turn.tau, self.turn.rates, self.turn.parabola)
             for part, off in zip((TURN, ANGULAR), late, strict=True):
                 joint[part, part] += self.turn.delay**2 * np.outer(off, off)
@@ -254,7 +254,7 @@ class Estimate(Motion):
 
 @entry
 def _widening(added: Array2, scale: Array1) -> Array:
-    """Return the positive semidefinite part of a symmetric matrix (n,n), ``scale`` its units."""
+    """Return the positive semidefinite part of a symmetric matrix (n,n) in units ``scale`` (n,)."""
     units = np.outer(scale, scale)
     values, vectors = np.linalg.eigh(added / units)
     part: Array = (vectors * np.maximum(values, 0.0)) @ vectors.T * units
@@ -264,8 +264,8 @@ def _widening(added: Array2, scale: Array1) -> Array:
 def beyond_rows(estimate: Estimate, tau: float) -> tuple[float, float]:
     """Return variances of the rotation (rad^2) and its rate, per readout, outside of the rows.
 
-    A camera that shakes within the rows shakes outside, too, in a phase that nobody knows: it is
-    taken to go on at one of the rates that it had. What gyroscopes have seen, is known.
+    A camera that vibrates within the rows vibrates outside, too, in an unknown phase: it is assumed
+    to rotate on at one of the rates that it had. Times that a gyroscope has measured add nothing.
     """
     beyond = abs(tau - within_rows(tau))
     if beyond == 0.0:
@@ -298,7 +298,7 @@ class Failure:
     def __str__(self) -> str:
         return f"{self.reason}: {self.detail}"
 
-    if not TYPE_CHECKING:  # which knows what there is
+    if not TYPE_CHECKING:  # a type checker knows the fields
 
         def __getattr__(self, name: str) -> NoReturn:
             if name.startswith("_") or name in ("reason", "detail"):

@@ -81,7 +81,7 @@ def _smooth(values: Array, axis: int) -> Array:
 
 
 def _window(values: Array) -> Array:
-    """Return the sums over windows."""
+    """Return the sums over square windows of values (n,s,s)."""
     side = 2 * _WINDOW + 1
     windows = np.lib.stride_tricks.sliding_window_view(values, (side, side), (1, 2))
     sums: Array = windows.sum(axis=(3, 4))

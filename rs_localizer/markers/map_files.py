@@ -259,7 +259,7 @@ _NUMBER = (int, float)
 
 
 class _EntryError(ValueError):
-    """Says already which entry it is about."""
+    """An error whose message names the entry of the file."""
 
 
 class _Entry:
@@ -276,7 +276,7 @@ class _Entry:
 
     @property
     def names(self) -> str:
-        """The keys that are left."""
+        """The keys that have not been taken yet."""
         return ", ".join(map(str, self._left)) or "nothing else"
 
     def value(self, name: str, kind: type | tuple[type, ...], *default: Any) -> Any:

@@ -116,7 +116,7 @@ class _Board:
         return replace(self, shape=shape, deviation=deviation)
 
     def _check(self, least: tuple[int, int], wanted: str, *lengths: str) -> None:
-        """Check what every board is checked for, and the ``lengths`` by their names."""
+        """Raise ValueError for a board of unusable size, lengths (names of fields, m) or shape."""
         if self.columns < least[0] or self.rows < least[1]:
             raise ValueError(f"{wanted}, got {self.columns}x{self.rows}")
         if max(self.columns, self.rows) > _MOST_SQUARES:

@@ -363,7 +363,10 @@ class Matcher:
         return Matches(rows, self._order[places[rows]], scores, MatchBy.ID)
 
     def _anywhere(self, queries: Descriptors) -> tuple[Nearest, IntArray]:
-        """Return the two nearest of all landmarks, and for each query its rival (q,)."""
+        """Return the two landmarks nearest to each query, and the query nearest to the first one.
+
+        A landmark that is nearer to another query (q,) is no match of this one.
+        """
         assert self._index is not None
         assert self.map.descriptors is not None
         nearest = self._index.nearest(queries)

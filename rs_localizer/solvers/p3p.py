@@ -105,7 +105,7 @@ def _lines(m: Symmetric) -> tuple[Vector, Vector]:
 
 
 def _polish(depths: Vector, cosines: Vector, squares: Vector) -> Vector:
-    """Return the newton steps on the three quadrics (squares of the sides 12, 13, 23)."""
+    """Return depths (3) after Newton steps on the three quadrics (squares of sides 12, 13, 23)."""
     b12, b13, b23 = cosines
     x, y, z = depths
     for _ in range(_DEPTH_STEPS):

@@ -57,7 +57,7 @@ def _place(*factors: tuple[int, ...]) -> int:
 
 
 def _products(degree: int) -> Array:
-    """Return (4 m, k): what a product with a linear polynomial makes of one of that degree."""
+    """Return the matrix (4 m, k) of products of linear polynomials and m monomials of a degree."""
     factors = itertools.product(_MONOMIALS[:4], _MONOMIALS[: _COUNT[degree]])
     return np.eye(_COUNT[degree + 1])[[_place(*pair) for pair in factors]]
 
@@ -115,13 +115,13 @@ def find_solutions(points: Array, rays: Array, tau: Array, bound: float = BOUND)
 
 
 def _seen(vectors: Array, rays: Array) -> Array:
-    """Return (...,12): the equations of vectors (...,6,3) that should lie along rays (...,6,2)."""
+    """Return the equations (...,12) of vectors (...,6,3) that should lie along rays (...,6,2)."""
     equations = vectors[..., :2] - rays * vectors[..., 2:]
     return equations.reshape(*equations.shape[:-2], 12)
 
 
 def _of_translations(rays: Array, tau: Array) -> Array:
-    """Return (h,12,6): the coefficients of C and t."""
+    """Return the coefficients (h,12,6) of C and t in the twelve equations of each sample."""
     moved = np.broadcast_to(_AXES[:, None, None], (3, len(rays), 6, 3))
     columns = [_seen(axis * r, rays) for r in (1.0, tau[..., None]) for axis in moved]
     return np.stack(columns, axis=-1)
@@ -176,7 +176,7 @@ def _polished(a: Array, v: Array) -> tuple[Array, Array, Array]:
 def _translations(
     points: Array, rays: Array, tau: Array, v: Array, w: Array
 ) -> tuple[Array, Array]:
-    """Return C and t (c,3)."""
+    """Return C and t (c,3) of candidates v and w, by least squares."""
     turned = points + np.cross(v[:, None], points)
     known = _seen(turned + tau[..., None] * np.cross(w[:, None], turned), rays)
     both = -(np.linalg.pinv(_of_translations(rays, tau)) @ known[..., None])[..., 0]

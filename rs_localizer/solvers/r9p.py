@@ -136,7 +136,7 @@ def solve_batch(
     points: Array2, rays: Array2, tau: Array1, samples: IntArray2, rotations: Array3,
     iterations: int, models: Out[Array3],
 ) -> None:  # fmt: skip
-    """Trace fixed; arguments and result as in :mod:`rs_localizer.solvers.batch`."""
+    """Solve a batch, trace fixed; arguments and result as in :mod:`rs_localizer.solvers.batch`."""
     _solve_each(points, rays, tau, samples, rotations, models, True)
 
 

@@ -56,6 +56,30 @@ def test_every_figure_of_the_rest_is_in_the_file_that_it_links_to(item):
     assert {number for number in NUMBER.findall(figures) if number not in known} == set()
 
 
+LINKED = [
+    (page, " ".join(said.split()))
+    for page in pages.NAMES
+    if page.startswith("docs/") and page != "docs/benchmarks.md"
+    for said in re.split(r"(?<=[.;:])\s+|\n\n|\n\* ", pages.prose(page))
+    if "](benchmarks.md#" in said
+]
+
+
+@pytest.mark.parametrize(("page", "said"), LINKED)
+def test_figures_of_a_sentence_are_in_the_tables_that_it_links_to(page, said):
+    anchor = re.search(r"\]\(benchmarks\.md#([\w-]+)\)", said)[1]
+    part = section(anchor)
+    printed = [*blocks(part).values()]
+    linked = re.findall(r"\]\(\.\./benchmarks/results/([\w-]+)\.txt\)", part)
+    printed += [(RESULTS / f"{name}.txt").read_text(encoding="utf-8") for name in linked]
+    known = [float(number) for text in printed for number in NUMBER.findall(text)]
+    figures = re.sub(r"`[^`]*`|\]\([^)]*\)", "", said)
+    for number in NUMBER.findall(figures):
+        digits = len(number.partition(".")[2])
+        near = {round(x, digits) for value in known for x in (value, 100.0 * value)}
+        assert float(number) in near, (page, number)
+
+
 def test_the_picture_of_errors_is_of_the_run_whose_medians_are_printed():
     rows = (RESULTS / "demo.txt").read_text(encoding="utf-8").splitlines()
     columns = rows[0].split()[1:]
@@ -103,7 +127,18 @@ def test_the_table_of_what_is_noticed_is_what_its_bench_printed():
         assert found, line
         printed.setdefault(name, []).append((found[1], found[2]))
     (table,) = [t for t in pages.all_tables("kind", "said") if t.page == "docs/limits.md"]
-    assert {row[0] for row in table.rows} == {kind for kind in printed if "right" not in kind}
+    wrong = {kind for kind, runs in printed.items() if any(int(beyond) for _, beyond in runs)}
+    assert {row[0] for row in table.rows} == wrong
     for kind, published, beyond, _ in table.rows:
         said = list(zip(published.split(", "), beyond.split(", "), strict=True))
         assert said == printed[kind], kind
+
+
+def test_the_latency_in_readme_is_what_the_bench_of_the_node_printed():
+    said = " ".join(pages.text("README.md").split())
+    found = re.search(r"in (\d+) to (\d+) ms \(median; 99 %: (\d+) to (\d+) ms\)", said)
+    least, most, least_99, most_99 = map(int, found.groups())
+    printed = (RESULTS / "load.txt").read_text(encoding="utf-8")
+    median, p99 = map(float, re.search(r"p50 (\S+) ms, p99 (\S+) ms", printed).groups())
+    assert least <= round(median) <= most
+    assert least_99 <= round(p99) <= most_99

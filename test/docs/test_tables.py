@@ -23,11 +23,11 @@ from rs_localizer.ros.node.diagnostics import State
 from rs_localizer.settings import FIRST, Kind, settings
 from rs_localizer.solvers.table import SOLVERS, find_solver
 
-OF_NODES: list[tuple[Kind, set[str]]] = [
-    (NodeConfig, {*pages.NAMES} - {"docs/detector.md", "docs/features.md"}),
-    (DetectorConfig, {"docs/detector.md"}),
-    (FeatureConfig, {"docs/features.md"}),
+OF_DETECTORS: list[tuple[Kind, str]] = [
+    (DetectorConfig, "docs/detector.md"),
+    (FeatureConfig, "docs/features.md"),
 ]
+PARAMETER = re.compile(r"^ +(\w+): *[^#\n]*(?:# (.+))?$", re.MULTILINE)
 
 
 def documented(where: set[str]) -> Iterator[tuple[str, str, str]]:
@@ -42,13 +42,30 @@ def documented(where: set[str]) -> Iterator[tuple[str, str, str]]:
                 yield from ((table.page, *item) for item in zip(given, values, strict=True))
 
 
-@pytest.mark.parametrize(("kind", "where"), OF_NODES)
-def test_every_parameter_is_in_a_table_with_its_default(kind, where):
+@pytest.mark.parametrize(("kind", "page"), OF_DETECTORS)
+def test_every_parameter_of_a_detector_is_in_a_table_with_its_default(kind, page):
     known = settings(kind)
-    rows = [row for row in documented(where) if "*" not in row[1]]
-    assert {name for _, name, _ in rows} == set(known)
+    assert {name for _, name, _ in documented({page})} == set(known)
+    for _, name, default in documented({page}):
+        assert read(default, known[name].default) == known[name].default, name
+
+
+def test_tables_of_the_localizers_parameters_have_its_defaults():
+    known, rows = settings(), list(documented({*pages.NAMES} - {page for _, page in OF_DETECTORS}))
+    assert len(rows) >= 6
     for page, name, default in rows:
         assert read(default, known[name].default) == known[name].default, (page, name)
+
+
+def test_the_list_of_parameters_explains_each_and_says_which_are_fixed():
+    """Defaults and choices: test_settings.py."""
+    text = (pages.ROOT / "config" / "rs_localizer.yaml").read_text(encoding="utf-8")
+    said = dict(PARAMETER.findall(text.split("ros__parameters:")[1]))
+    for name, setting in settings().items():
+        comment = said[name.rsplit(".", 1)[-1]]
+        assert comment, name
+        assert ("[start]" in comment) is setting.read_only, name
+        assert ("[fixed]" in comment) is (setting.fixed and not setting.read_only), name
 
 
 def test_the_node_and_the_help_begin_with_what_everybody_sets():
@@ -112,12 +129,6 @@ def test_the_topics_of_the_localizer():
     assert sent.pop("reset") == "std_srvs/Trigger"
     every = {**TYPES, **LIVE}
     assert sent == {name: kind.replace("/msg/", "/") for name, kind in every.items()}
-
-
-def test_the_diagram_of_the_node_has_every_topic():
-    (diagram,) = pages.fenced("docs/node.md", "mermaid")
-    for name in (*taken_topics(), *(f"~/{name}" for name in TYPES)):
-        assert name in diagram
 
 
 def test_every_notice_is_explained_and_given_somewhere():

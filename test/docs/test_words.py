@@ -29,7 +29,7 @@ VERBS = frozenset(
     Collect Compare Compress Compute Configure Convert Copy Correct Count Create Decide Declare
     Decode Delay Describe Detect Divide Do Draw Drop Encode End Estimate Expand Explain Extract
     Fill Filter Find Finish Fit Forget Format Give Group Import Integrate Interpolate Interpret
-    Join Judge Keep Learn Let Limit Linearize Link Listen Load Localize Lock Log Look Lower Make
+    Join Judge Keep Lay Learn Let Limit Linearize Link Listen Load Localize Lock Log Look Lower Make
     Map Match Measure Minimize Mix Move Multiply Name Note Number Open Optimize Order Pack Parse
     Place Predict Prepare Print Project Publish Put Queue Raise Read Reconstruct Reduce Refine
     Reflect Refuse Remember Remove Repeat Replay Return Round Run Sample Say Search Select Send

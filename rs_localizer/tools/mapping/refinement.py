@@ -476,7 +476,7 @@ def _as_in(one: Adjusted, state: Unknowns) -> Adjusted:
 def _laid(
     problem: Problem, state: Unknowns, factored: Factored, usable: BoolArray
 ) -> tuple[Similarity, Array, Array]:
-    """Lay a map over the one that was given, unless landmarks of known place hold it.
+    """Return how a map is laid over the given one, unless landmarks of known place hold it.
 
     Args:
         problem: whose minimum the state is.
