@@ -9,14 +9,13 @@ It is Laplace's approximation about the optimum. If a plane's lean is hardly kno
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray1, IntArray
 from rs_localizer.core.so3 import exp
-from rs_localizer.core.state import PARAMETERS, TURN, rotation_of, step_between
+from rs_localizer.core.state import PARAMETERS, STATE_SIZE, TURN, step_between
 from rs_localizer.estimation.gaussian import Gaussians, mixture
 from rs_localizer.estimation.linear_fit import (
     NO_TURN,
@@ -33,7 +32,7 @@ from rs_localizer.estimation.prior import PriorTerms
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.robust import TINY, apply_step
 from rs_localizer.estimation.smooth_error import Shared
-from rs_localizer.native import entry, inlined
+from rs_localizer.native import entry, inlined, kernel
 
 # Linearizations of a mode, at most; and the last one is where the step to the optimum leaves its
 # tangent by less than this part of the noise.
@@ -132,112 +131,115 @@ def _bent(step: Array, frame: Frame) -> float:
     return 0.5 * frame.focal_length * total * total
 
 
-class _Grid(NamedTuple):
-    """Leans along axes that are hardly known, in steps from that of a mode."""
-
-    frame: Frame
-    terms: PriorTerms
-    alone: Mode
-    axes: Array  # (k,3) of rotations, camera axes
-    steps: Array  # (k,) rad
-    centre: Array  # (3,) of the plane
-
-    def turned(self, place: Sequence[int] | IntArray) -> Array:
-        """Return the rotation (3,3) from the mode to a place (k,)."""
-        return exp(-(place * self.steps) @ self.axes)
-
-
 def over_leans(frame: Frame, mode: Mode, terms: PriorTerms) -> Mode:
-    """Integrate the mode of a plane over its leans, if they are hardly known.
-
-    There is a Gaussian beside each lean of a grid, along the one or two axes that are hardly known.
-    Noise, inliers and the size of the smooth error are those of the mode.
-    """
-    plane, centre, normal = plane_of(frame.points, frame.chosen)
-    across = rotation_of(mode.state) @ normal
-    flat = np.eye(3) - np.outer(across, across)
-    sizes, axes = np.linalg.eigh(flat @ mode.covariance[TURN, TURN] @ flat)
-    if not (plane and sizes[2] > _KNOWN_LEAN**2):
-        return mode
-    # The mirrored lean may lie beyond others that are out of the question.
-    twin = leaning_less(mode.state, centre, normal, 2.0)
-    away = axes.T @ step_between(mode.state, twin)[TURN]
-    worst = [2, 1] if max(sizes[1], away[1] ** 2) > _KNOWN_LEAN**2 else [2]
-    steps = _SPACING * np.sqrt(np.maximum(sizes[worst], TINY))
-    frame = frame._replace(
+    """Integrate the mode of a plane over its leans, if they are hardly known."""
+    held = frame._replace(
         shared=frame.shared.at(mode.size), noise=frame.noise._replace(deviation=mode.noise)
     )
-    # The mode is evaluated with its own noise and smooth error, not with a mixture of sizes.
-    alone, _, _ = mode_of(frame, mode.state, linear_at(frame, mode.state), terms)
-    if not alone.evidence > -math.inf:
+    states, covariances, evidences, whole = _leans(held, mode, terms)
+    if not (len(states) and np.isfinite(whole)):
         return mode
-    grid, origin = _Grid(frame, terms, alone, axes.T[worst], steps, centre), (0,) * len(worst)
-    starts: dict[tuple[int, ...], Array] = {origin: alone.state}
-    parts: dict[tuple[int, ...], tuple[Mode, float]] = {}
-    _explore(grid, starts, parts, 2 * len(worst) + 1)  # the lean of the mode, and those beside it
-    known = np.array([evidence for _, evidence in parts.values()])
-    falls = known[0] - 0.5 * (known[1::2] + known[2::2])
-    if np.any(falls > _SPACING**2):
-        shares = _SPACING / np.sqrt(2.0 * np.maximum(falls, 0.5 * _SPACING**2))
-        steps = steps * np.where(falls > _SPACING**2, np.maximum(shares, _LEAST_SHARE), 1.0)
-        grid, starts, parts = grid._replace(steps=steps), {origin: alone.state}, {}
-        _explore(grid, starts, parts, len(known))
-    starts.setdefault(tuple(np.rint(away[worst] / steps).astype(int).tolist()), twin)
-    _explore(grid, starts, parts, _MOST_PARTS)
-    modes, evidences = zip(*parts.values(), strict=True)
-    if not max(evidences) > -math.inf:
-        return mode
-    area = float(np.log(steps / (_PIN * steps[-1] * math.sqrt(2.0 * math.pi))).sum())
-    leaning = Gaussians(
-        np.array([part.state for part in modes]), np.zeros((len(modes), 0)),
-        np.array([part.covariance for part in modes]), np.array(evidences) + area,
-    )  # fmt: skip
-    mixed = mixture(leaning, np.zeros(len(modes)), 1.0)
+    parts = Gaussians(states, np.zeros((len(states), 0)), covariances, evidences)
+    mixed = mixture(parts, np.zeros(len(states)), 1.0)
     return mode._replace(
         state=mixed.state, covariance=mixed.covariance,
-        evidence=mode.evidence + mixed.evidence - alone.evidence,
+        evidence=mode.evidence + mixed.evidence - whole,
     )  # fmt: skip
 
 
-def _explore(
-    grid: _Grid, starts: dict[tuple[int, ...], Array],
-    parts: dict[tuple[int, ...], tuple[Mode, float]], most: int,
-) -> None:  # fmt: skip
-    """Fit the leans from their starts, in this order, and those beside all that are probable."""
-    sides: IntArray = np.eye(len(grid.steps), dtype=np.int64)
-    while len(parts) < min(len(starts), most):
-        place, start = list(starts.items())[len(parts)]
-        part = _pinned(grid, place, start)
-        if not part.evidence > -math.inf:
-            parts[place] = part, -math.inf
+@kernel
+def _evidence_of(mode: Mode, least: float, freedom: float) -> float:
+    """Return the evidence with the noise that the least cost leaves.
+
+    Student's: what a motion leaves beyond the best one tells the less, the fewer the points.
+    """
+    beyond = max((mode.cost - least) / freedom, _MOST_BETTER - 1.0)
+    return mode.evidence + 0.5 * (mode.cost - least - freedom * math.log1p(beyond))
+
+
+@entry
+def _leans(frame: Frame, mode: Mode, terms: PriorTerms) -> tuple[Array, Array, Array, float]:
+    """Return Gaussians beside the leans of a grid, along the one or two axes that are hardly known.
+    Noise, inliers and the size of the smooth error are taken from the mode.
+
+    Returns:
+        states (k,24), covariances (k,18,18), evidences (k,), of nothing where the lean is known;
+        and that of the mode itself.
+    """
+    rotation, count = mode.state[:9].copy().reshape(3, 3), len(terms.informations)
+    plane, centre, normal = plane_of(frame.points, frame.chosen)
+    normal = rotation @ normal
+    flat = np.eye(3) - normal * normal.reshape(3, 1)
+    sizes, axes = np.linalg.eigh(flat @ mode.covariance[TURN, TURN].copy() @ flat)
+    if not (plane and sizes[2] > _KNOWN_LEAN**2):
+        nothing = np.zeros((0, PARAMETERS, PARAMETERS))
+        return np.zeros((0, STATE_SIZE)), nothing, np.zeros(0), 0.0
+    # The mirrored lean may lie beyond others that are out of the question.
+    _, twin = leaning_less(frame.points, frame.chosen, mode.state, 2.0)
+    away = axes.T @ step_between(mode.state, twin)[TURN]
+    used = 2 if max(sizes[1], away[1] ** 2) > _KNOWN_LEAN**2 else 1
+    axes, away = axes.T[::-1][:used].copy(), away[::-1][:used].copy()
+    steps = _SPACING * np.sqrt(np.maximum(sizes[::-1][:used], TINY))
+    # The mode is evaluated with its own noise and smooth error, not with a mixture of sizes.
+    alone, _, _ = mode_of(frame, mode.state, linear_at(frame, mode.state), terms)
+    freedom = max(mode.freedom, 6.0)
+    informations = np.zeros((count + 1, PARAMETERS, PARAMETERS))
+    references, pivots = np.empty((count + 1, STATE_SIZE)), np.zeros((count + 1, 3))
+    informations[:count], references[:count] = terms.informations, terms.references
+    pivots[:count] = terms.pivots
+    pinned = PriorTerms(informations, references, terms.gravity, pivots)
+    places, starts = np.zeros((_MOST_PARTS, used), np.int64), np.empty((_MOST_PARTS, STATE_SIZE))
+    states, evidences = np.empty((_MOST_PARTS, STATE_SIZE)), np.empty(_MOST_PARTS)
+    covariances = np.empty((_MOST_PARTS, PARAMETERS, PARAMETERS))
+    starts[0], first, last, best, measured = alone.state, 0, 1, -np.inf, False
+    while first < last:
+        turn = exp(-(places[first] * steps) @ axes)
+        references[count], references[count, :9] = starts[first], (turn @ rotation).ravel()
+        across = axes @ turn.T / (_PIN * steps[used - 1])
+        informations[count, TURN, TURN] = across.T @ across
+        part, _, _ = mode_of(frame, starts[first], linear_at(frame, starts[first]), pinned)
+        states[first], covariances[first] = part.state, part.covariance
+        evidences[first] = _evidence_of(part, alone.cost, freedom)
+        best, first = max(best, evidences[first]), first + 1
+        if first == 2 * used + 1:  # the lean of the mode, and those beside it
+            shrunk = False
+            for axis in range(used):
+                beside = evidences[2 * axis + 1] + evidences[2 * axis + 2]
+                falls = evidences[0] - 0.5 * beside
+                if falls > _SPACING**2 and not measured:
+                    steps[axis] *= max(_SPACING / math.sqrt(2.0 * falls), _LEAST_SHARE)
+                    shrunk = True
+            measured = True
+            if shrunk:
+                first, last, best = 0, 1, -np.inf
+                continue
+            last = _queue(places, starts, last, np.rint(away / steps).astype(np.int64), twin)
+        if not evidences[first - 1] > best - _LEAST_PART:
             continue
-        # With the noise that the least cost leaves (Student's): what a motion leaves beyond the
-        # best one tells the less, the fewer the points.
-        freedom, more = max(grid.alone.freedom, 6.0), part.cost - grid.alone.cost
-        beyond = max(more / freedom, _MOST_BETTER - 1.0)
-        evidence = part.evidence + 0.5 * (more - freedom * math.log1p(beyond))
-        parts[place] = part, evidence
-        if not evidence > max(each for _, each in parts.values()) - _LEAST_PART:
-            continue
-        old = rotation_of(part.state)
-        for side in (each for axis in sides for each in (axis, -axis)):
-            begin, beside = part.state.copy(), place + side
+        near = states[first - 1]
+        old = near[:9].copy().reshape(3, 3)
+        for k in range(2 * used):
+            place, begin = places[first - 1].copy(), near.copy()
+            place[k // 2] += 1 - k % 2 * 2
             # About the middle of the plane.
-            new = grid.turned(beside) @ grid.turned(place).T @ old
-            begin[:9], begin[9:12] = new.ravel(), begin[9:12] + (old - new) @ grid.centre
-            if len(starts) < _MOST_PARTS:
-                starts.setdefault(tuple(beside.tolist()), begin)
+            new = exp(-(place * steps) @ axes) @ turn.T @ old
+            begin[:9] = new.ravel()
+            begin[9:12] += old @ centre - new @ centre
+            last = _queue(places, starts, last, place, begin)
+    if not best > -np.inf:
+        last = 0
+    area = np.prod(steps / (_PIN * steps[used - 1] * math.sqrt(2.0 * math.pi)))
+    evidences[:last] += math.log(area)
+    return states[:last], covariances[:last], evidences[:last], alone.evidence
 
 
-def _pinned(grid: _Grid, place: Sequence[int], start: Array) -> Mode:
-    """Return the Gaussian about the optimum near a start (24,) with the lean of a place."""
-    turn, terms = grid.turned(place), grid.terms
-    across = grid.axes @ turn.T / (_PIN * grid.steps[-1])
-    pin, reference = np.zeros((1, PARAMETERS, PARAMETERS)), start.copy()
-    pin[0, TURN, TURN] = across.T @ across
-    reference[:9] = (turn @ rotation_of(grid.alone.state)).ravel()
-    pinned = PriorTerms(
-        np.concatenate([terms.informations, pin]), np.vstack([terms.references, reference]),
-        terms.gravity, np.vstack([terms.pivots, np.zeros(3)]),
-    )  # fmt: skip
-    return mode_of(grid.frame, start, linear_at(grid.frame, start), pinned)[0]
+@inlined
+def _queue(places: IntArray, starts: Array, last: int, place: IntArray, start: Array) -> int:
+    """Put a place of a grid behind the others, if it is new and there is room; their number."""
+    for k in range(last):
+        if np.all(places[k] == place):
+            return last
+    if last < len(places):
+        places[last], starts[last] = place, start
+        last += 1
+    return last

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rs_localizer.core import so3
 from rs_localizer.core.arrays import (
     Array,
     Array1,
@@ -28,7 +29,6 @@ from rs_localizer.core.gyro_rotation import GyroRotation, gyro_compensated
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Mounts, Rig
 from rs_localizer.core.simd.tracing import LANES
-from rs_localizer.core.so3 import exp, hat
 from rs_localizer.core.types import Failure
 from rs_localizer.estimation.prior import Assumed, PriorTerms
 from rs_localizer.estimation.projection import (
@@ -461,26 +461,47 @@ def packed(exposure: Exposure, points: Array, usable: Usable) -> Observations:
 
 # Points whose depth relief is a smaller part than this of their narrower extent are a plane.
 _PLANE = 0.1
+# A plane that leans by less (rad) faces the camera.
+_LEAST_LEAN = 0.01
 
 
-def leaning_less(state: Array, centre: Array, normal: Array, leans: float) -> Array:
-    """Return the state (24,) with the lean of a plane reduced so many times.
+@entry
+def leaning_less(
+    points: Array2, inliers: BoolArray1, state: Array1, leans: float
+) -> tuple[bool, Array]:
+    """Return True and the state (24,) with the plane's lean reduced so many times.
 
-    Once its lean less it faces the camera. Twice less it leans to the other side: from far away, or
-    on a small marker, both look alike up to perspective (Schweighofer, Pinz, "Robust pose
-    estimation from a planar target", PAMI 2006).
-
-    Args:
-        centre, normal: (3,) of the plane.
+    Twice its lean less it is mirrored, once it faces the camera. False if the points (n,3) that
+    count are no plane, or face the camera.
     """
-    rotation, other = state[:9].reshape(3, 3), state.copy()
-    seen, across = rotation @ centre + state[9:12], rotation @ normal
-    sight = seen / np.linalg.norm(seen)
-    axis = hat(sight) @ across * np.sign(sight @ across)
-    length = max(float(np.linalg.norm(axis)), 1e-300)
-    turned = exp(-leans * math.asin(min(length, 1.0)) / length * axis) @ rotation
-    other[:9], other[9:12] = turned.ravel(), seen - turned @ centre
-    return other
+    plane, centre, axis_of_plane = plane_of(points, inliers)
+    if not plane:
+        return False, state
+    seen, normal = state[9:12].copy(), np.zeros(3)
+    for i in range(3):
+        for k in range(3):
+            seen[i] += state[3 * i + k] * centre[k]
+            normal[i] += state[3 * i + k] * axis_of_plane[k]
+    sight = seen / np.sqrt(np.sum(seen * seen))
+    normal *= np.sign(np.sum(sight * normal))
+    axis = np.empty(3)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        axis[i] = sight[j] * normal[k] - sight[k] * normal[j]
+    length = np.sqrt(np.sum(axis * axis))
+    lean = np.arcsin(min(length, 1.0))
+    if lean < _LEAST_LEAN:
+        return False, state
+    flip = so3.exp(-leans * lean / length * axis)
+    other = state.copy()
+    for i in range(3):
+        other[9 + i] = seen[i]
+        for k in range(3):
+            other[9 + i] += flip[i, k] * (state[9 + k] - seen[k])
+            other[3 * i + k] = 0.0
+            for m in range(3):
+                other[3 * i + k] += flip[i, m] * state[3 * m + k]
+    return True, other
 
 
 @entry

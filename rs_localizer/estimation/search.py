@@ -31,7 +31,7 @@ from rs_localizer.core.arrays import (
 from rs_localizer.core.blocks import write
 from rs_localizer.core.rig import Mounts
 from rs_localizer.core.state import STATE_SIZE, rotation_of
-from rs_localizer.estimation.points import Observations, Observed, leaning_less, plane_of
+from rs_localizer.estimation.points import Observations, Observed, leaning_less
 from rs_localizer.estimation.prior import PriorTerms, held_terms
 from rs_localizer.estimation.projection import truncated_cost
 from rs_localizer.estimation.robust import EXPECTED_NOISE, anneal, refine
@@ -465,10 +465,9 @@ class MotionSearch:
         leans by tens of degrees; from there the way leads to other leans, and samples of six noisy
         points tell leaning from moving no better.
         """
-        plane, centre, normal = plane_of(observed.observations.points, near)
-        if not plane:
+        leans, towards = leaning_less(observed.observations.points, near, start.state, 1.0)
+        if not leans:
             return found
-        towards = leaning_less(start.state, centre, normal, 1.0)
         other = self.optimize(observed, towards, self._near, observed.terms)
         return other if other.cost < found.cost else found
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.core import so3
-from rs_localizer.estimation.points import leaning_less, plane_of
+from rs_localizer.estimation.points import leaning_less
 
 MOTION = np.linspace(0.01, 0.12, 12)  # velocities and accelerations
 
@@ -20,9 +20,9 @@ def plane():
 def seen(points, turn, leans, sight):
     """State (24,) that leans less, of a camera that sees the points' middle there."""
     state = np.concatenate([turn.ravel(), sight - turn @ points[:40].mean(axis=0), MOTION])
-    found, centre, normal = plane_of(points, np.ones(len(points), dtype=bool))
+    found, other = leaning_less(points, np.ones(len(points), dtype=bool), state, leans)
     assert found
-    return leaning_less(state, centre, normal, leans)
+    return other
 
 
 @pytest.mark.parametrize("leans", [2.0, 1.0])
