@@ -141,10 +141,10 @@ def calibration_effect(
     rows = np.concatenate([by_motion, smooth, columns], axis=2).reshape(2 * len(rays), -1)
     every = rows.T @ rows
     still, of_pose = math.inf, inverted(every[POSE, POSE].copy())
-    if np.isfinite(of_pose).all():
+    if math.isfinite(of_pose[0, 0]):
         still = longest_axis(posterior.inflation * variance * of_pose)
     products, crossed = every[:fitted, :fitted].copy(), every[:fitted, fitted:]
-    products[PARAMETERS:, PARAMETERS:] += variance * np.eye(fitted - PARAMETERS)
+    products.flat[PARAMETERS * (fitted + 1) :: fitted + 1] += variance
     of_errors = crossed[:PARAMETERS]
     if tracked:  # else the covariance has what the smooth error does
         crossed = np.hstack([crossed, variance * np.eye(fitted)[:, PARAMETERS:]])
@@ -157,7 +157,7 @@ def calibration_effect(
         information = products.copy()
         information[:PARAMETERS, :PARAMETERS] += prior
         inverse = inverted(information)
-        if not np.isfinite(inverse).all():
+        if not math.isfinite(inverse[0, 0]):
             return NO_EFFECT._replace(still_deviation=still)
         pull -= part * (inverse[:MOTION_PARAMETERS] @ crossed)
         taken += part * (inverted(products[:PARAMETERS, :PARAMETERS] + prior) @ of_errors)

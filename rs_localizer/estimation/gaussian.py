@@ -29,10 +29,16 @@ from rs_localizer.estimation.prior import offset_between
 from rs_localizer.estimation.robust import apply_step
 from rs_localizer.native import entry
 
-# -(a x b)_i is a^T of the i-th of these b.
+# Of y = (phi, d): d = -rho + [p]x phi by p; the forms of -phi x d, and of -phi x (phi x p) / 2 =
+# (p (phi . phi) - phi (phi . p)) / 2 by p.
+_BY_STEP, _BY_CENTRE = np.diag(np.repeat([1.0, -1.0], 3)), np.zeros((3, 6, 6))
+_CROSSES, _TWICE_CROSSED = np.zeros((3, 6, 6)), np.zeros((3, 3, 6, 6))
 _UNIT = np.eye(3)
-_CROSSES = hat(_UNIT)
-_BY_STEP = np.diag(np.repeat([1.0, -1.0], 3))
+_BY_CENTRE[:, MOVE, TURN] = hat(_UNIT)
+_CROSSES[:, TURN, MOVE], _CROSSES[:, MOVE, TURN] = 0.5 * hat(_UNIT), -0.5 * hat(_UNIT)
+_SQUARES = 0.5 * _UNIT[:, :, None, None] * _UNIT
+_OUTER = _UNIT[None, :, :, None] * _UNIT[:, None, None]  # p_c phi_i phi_c
+_TWICE_CROSSED[:, :, TURN, TURN] = _SQUARES - 0.25 * (_OUTER + _OUTER.transpose(0, 1, 3, 2))
 
 
 class Gaussians(NamedTuple):
@@ -164,15 +170,9 @@ def along_arcs(
         covariances: (k,18,18) of the offsets.
     """
     # y = (phi, d): d = -rho + [p]x phi.
-    by_step, forms, count = _BY_STEP.copy(), np.zeros((3, 6, 6)), len(weights)
-    by_step[MOVE, TURN] = hat(centre)
-    # -(phi x (phi x p))_i / 2 = (p_i (phi . phi) - phi_i (phi . p)) / 2
-    each = _UNIT[:, :, None] * centre
-    forms[:, TURN, TURN] = 0.5 * centre[:, None, None] * _UNIT
-    forms[:, TURN, TURN] -= 0.25 * (each + each.transpose(0, 2, 1))
-    # -(phi x d)_i
-    forms[:, TURN, MOVE] = 0.5 * _CROSSES
-    forms[:, MOVE, TURN] = -0.5 * _CROSSES
+    by_step = _BY_STEP + (centre @ _BY_CENTRE.reshape(3, -1)).reshape(6, 6)
+    forms = _CROSSES + (centre @ _TWICE_CROSSED.reshape(3, -1)).reshape(3, 6, 6)
+    count = len(weights)
     means, crossed = offsets[:, :6] @ by_step.T, covariances[:, :, :6] @ by_step.T
     both = by_step @ crossed[:, :6]
     products, pulls = forms @ both[:, None], (forms @ means[:, None, :, None])[..., 0]

@@ -344,8 +344,8 @@ def search(
             best, shares = found, None
         if shares is None and best.found:
             near = observations.within(best.state, final)
-            of_pools = np.split(near[pools.points], pools.ends[:-1])
-            shares = np.array([np.mean(each) for each in of_pools])
+            counts = np.diff(pools.ends, prepend=0)
+            shares = np.add.reduceat(near[pools.points] * 1.0, pools.ends - counts) / counts
         bar = min(bar, costs[0])
         left = draws.most - int(drawn.sum())
         # The chance that none of the samples held inliers alone.
