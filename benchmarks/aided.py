@@ -14,6 +14,7 @@ from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.motions import Moving
 from benchmarks.independent.scenes import Scene
 from rs_localizer.core import camera as core
+from rs_localizer.inertial.gyro_prior import GyroscopeTrack
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.status import InertialSettings
 
@@ -51,9 +52,10 @@ class Recorded:
         )
         return ImuSamples(every.times_ns[first:last], every.angular_velocity[first:last])
 
-    @property
-    def settings(self) -> InertialSettings:
-        return InertialSettings(self.imu.noise, _BIAS_WALK)
+    def aid(self) -> GyroscopeTrack:
+        """Return what a tracker knows of the gyroscope before any frame."""
+        settings = InertialSettings(self.imu.noise, _BIAS_WALK)
+        return GyroscopeTrack(settings, self.frames.camera.readout_time)
 
 
 def record(

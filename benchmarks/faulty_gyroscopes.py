@@ -78,7 +78,7 @@ def followed(recorded: Recorded, with_imu: bool = True) -> Found:
         middle_ns, which = frames.middle_ns(frame), int(frames.recording[frame])
         if frames.place[frame] == 0:
             tracker = Tracker(
-                Localizer(believed(frames.camera)), recorded.settings if with_imu else None
+                Localizer(believed(frames.camera)), recorded.aid() if with_imu else None
             )
             buffer, every = ReadingBuffer(), recorded.samples[which]
             heard = 0
@@ -97,9 +97,9 @@ def followed(recorded: Recorded, with_imu: bool = True) -> Found:
                 said = found.reason.removeprefix("imu_")
             else:
                 samples = ImuSamples(found.stamps_ns, found.angular_velocities)
-        result = tracker.localize(middle_ns, *frames.seen(frame, _NOISE), imu=samples)
-        if samples is not None and tracker.inertial is not None:
-            status = tracker.inertial
+        result = tracker.localize(middle_ns, *frames.seen(frame, _NOISE), readings=samples)
+        if samples is not None and tracker.aid is not None:
+            status = tracker.aid.status
             used += status.unused is None
             said = status.oddity or said
         if frames.place[frame] >= _BEGIN:

@@ -17,9 +17,9 @@ from rs_localizer.config import LocalizerConfig, RefinementKind, localizer_confi
 from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.bearings import seen_at
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Rig, RigEstimate
+from rs_localizer.core.rotation_prior import RotationPrior
 from rs_localizer.core.state import POSE
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.acceptance import (
@@ -37,6 +37,7 @@ from rs_localizer.estimation.calibration import (
     widened,
 )
 from rs_localizer.estimation.hypotheses import Posterior, frame_posterior
+from rs_localizer.estimation.known_rotation import coupled_turn
 from rs_localizer.estimation.left_out import LeftOut, left_out
 from rs_localizer.estimation.points import (
     NEAREST,
@@ -66,7 +67,7 @@ _PREDICTION_SCALE = 16.0
 # With one standard deviation in each direction, 95 % of the points lie within this many of them
 # (Rayleigh's distribution).
 _MAP_GATE = 2.45
-# rad/s, twice the range of most gyroscopes (2000 deg/s).
+# rad/s, twice the range of most sensors (2000 deg/s).
 _FASTEST_RATE = 70.0
 _UNRANKED = np.zeros(0, np.int64)
 # A point is exposed at the time of its row, which depends on where it is seen. Each iteration
@@ -89,7 +90,7 @@ class _Inputs(NamedTuple):
     scores: Array | None
     prior: Prior | None
     expected_share: float
-    turn: GyroRotation | None
+    rotation: RotationPrior | None
     error_modes: ErrorModes | None
 
 
@@ -160,7 +161,7 @@ class Localizer:
         *,
         prior: Prior | None = None,
         expected_share: float = 0.5,
-        turn: GyroRotation | None = None,
+        rotation: RotationPrior | None = None,
         stamps: Mapping[str, float] | None = None,
     ) -> Estimate | Failure:
         """Estimate pose and velocities from one image, or from the images of a rig.
@@ -173,8 +174,8 @@ class Localizer:
             prior: other knowledge of the motion. A prior motion is also a first guess; if the
                 points do not agree with it, it is dropped and the whole search runs.
             expected_share: share of inliers among the points that a prior motion should find.
-            turn: rotation of the camera during the readout, by a gyroscope. A prior motion is then
-                the motion beside that rotation.
+            rotation: knowledge of the rotation of the camera during the readout. A prior motion is
+                then the motion beside that rotation.
             stamps: for a rig, times (s) at which the first row of each image was exposed, relative
                 to anything; None: all at once.
 
@@ -182,15 +183,17 @@ class Localizer:
             its reason. Same seed and same input give the same result.
 
         Raises:
-            ValueError: wrong shapes, values that are not finite, or a prior or turn where
+            ValueError: wrong shapes, values that are not finite, or a prior or rotation where
                 ``refinement`` uses none.
         """
-        if not self._full and (prior is not None or turn is not None):
+        if not self._full and (prior is not None or rotation is not None):
             raise ValueError(
                 f"refinement {self.config.refinement} knows the points alone: neither a prior nor "
-                "a turn"
+                "a rotation"
             )
-        return self.accepted(self.find(points, pixels, scores, prior, expected_share, turn, stamps))
+        return self.accepted(
+            self.find(points, pixels, scores, prior, expected_share, rotation, stamps)
+        )
 
     def accepted(self, found: Estimate | Failure) -> Estimate | Failure:
         """Return the estimate, or a :class:`Failure` if its orientation is too uncertain."""
@@ -206,7 +209,7 @@ class Localizer:
         scores: ArrayLike | None = None,
         prior: Prior | None = None,
         expected_share: float = 0.5,
-        turn: GyroRotation | None = None,
+        rotation: RotationPrior | None = None,
         stamps: Mapping[str, float] | None = None,
         error_modes: ErrorModes | None = None,
     ) -> Estimate | Failure:
@@ -216,17 +219,17 @@ class Localizer:
         covariances. Arguments that ``refinement`` does not use are ignored.
         """
         if not self._full:
-            prior = turn = None
+            prior = rotation = None
         if prior is not None:
             instance("prior", prior, Prior)
             self._check_rate(prior)
         if not 0.0 <= expected_share <= 1.0:
             raise ValueError(f"expected_share must lie between 0 and 1, got {expected_share}")
         sights = self._sights(points, pixels, scores, stamps)
-        given = _Inputs(*sights, prior, expected_share, turn, error_modes)
-        if turn is not None and not given.exposure.alone:
-            raise ValueError("a known turn is that of a camera alone, not of a rig")
-        if turn is not None:
+        given = _Inputs(*sights, prior, expected_share, rotation, error_modes)
+        if rotation is not None and not given.exposure.alone:
+            raise ValueError("a known rotation is that of a camera alone, not of a rig")
+        if rotation is not None:
             given = given._replace(exposure=given.exposure.ahead())
         found = self._found(given)
         if self._alone or not found:
@@ -234,14 +237,14 @@ class Localizer:
         return RigEstimate.of(found, given.exposure, given.counts)
 
     def _check_rate(self, prior: Prior) -> None:
-        """Refuse a gyroscope's rate that no gyroscope measures."""
+        """Refuse a rate that no sensor measures."""
         if prior.angular_velocity is None or not self._exposure.span > 0.0:
             return
         rate = float(np.linalg.norm(np.asarray(prior.angular_velocity, float)))
         if rate / self._exposure.span > _FASTEST_RATE:
             raise ValueError(
                 f"angular_velocity of the prior, {rate:.3g} rad per readout, would be "
-                f"{rate / self._exposure.span:.3g} rad/s, more than gyroscopes measure: is it in "
+                f"{rate / self._exposure.span:.3g} rad/s, more than sensors measure: is it in "
                 "rad/s, or in degrees? Multiply rad/s by the readout time"
             )
 
@@ -263,12 +266,12 @@ class Localizer:
         return checked_of_rig(self.rig, points, stamps)
 
     def _found(self, given: _Inputs) -> Estimate | Failure:
-        exposure, counts, points, pixels, scores, prior, expected_share, turn, modes = given
+        exposure, counts, points, pixels, scores, prior, expected_share, rotation, modes = given
         terms, assumed = self._assume(exposure.span)
-        if prior is not None or turn is not None:
-            terms, assumed = of_frame(terms, assumed, prior, turn)
+        if prior is not None or rotation is not None:
+            terms, assumed = of_frame(terms, assumed, prior, rotation)
         # 1. What can be used: finite, distinct, inside the image; packed relative to its median.
-        usable = find_usable(exposure, points, pixels, counts, turn)
+        usable = find_usable(exposure, points, pixels, counts, rotation)
         failure = unfit(exposure, pixels, usable, self.config.min_inliers)
         if failure is not None:
             return failure
@@ -278,7 +281,7 @@ class Localizer:
             terms,
             generator(self.config.seed),
             assumed,
-            Sighted(exposure, points, pixels, usable, turn),
+            Sighted(exposure, points, pixels, usable, rotation),
             modes,
         )
         # 2. Near the predicted motion, if the points agree with it (tracking).
@@ -306,7 +309,7 @@ class Localizer:
         threshold = self.config.inlier_threshold
         predicted = state_in(prior.motion, observed.centre)
         terms = with_motion(
-            observed.terms, prior, observed.centre, observed.sighted.turn is not None
+            observed.terms, prior, observed.centre, observed.sighted.rotation is not None
         )
         best = self._search.optimize(observed, predicted, _PREDICTION_SCALE * threshold, terms)
         posterior = self._settle(observed, best, terms)
@@ -347,18 +350,20 @@ class Localizer:
         return errors
 
     def known_of(
-        self, prior: Prior | None, span: float, turn: GyroRotation | None = None
+        self, prior: Prior | None, span: float, rotation: RotationPrior | None = None
     ) -> PriorTerms:
         """Return the prior of a frame in the map's frame, from all knowledge beside its points.
 
         Args:
             prior: of which the motion counts; None: the settings alone.
             span: s, of the row times.
-            turn: beside which the motion is.
+            rotation: beside which the motion is.
         """
         terms, assumed = self._assume(span)
-        terms, _ = of_frame(terms, assumed, None, turn)
-        return terms if prior is None else with_motion(terms, prior, np.zeros(3), turn is not None)
+        terms, _ = of_frame(terms, assumed, None, rotation)
+        return (
+            terms if prior is None else with_motion(terms, prior, np.zeros(3), rotation is not None)
+        )
 
     def _settle(self, observed: Observed, best: Candidate, terms: PriorTerms) -> Posterior:
         # Unless more is known of this very frame than the prior of the configuration.
@@ -367,8 +372,11 @@ class Localizer:
         if may_rest != assumed.may_rest:
             assumed = replace(assumed, may_rest=may_rest)
         gate, sighted = self._gate(observed, best.state), observed.sighted
+        if sighted.rotation is not None:
+            predicted = terms is not observed.terms
+            assumed = replace(assumed, in_frame=coupled_turn(sighted.rotation, predicted))
         observations = relinearized(
-            sighted.exposure, observed.observations, best.state, sighted.turn
+            sighted.exposure, observed.observations, best.state, sighted.rotation
         )
         if not self._full:
             seen = observations.packed, observations.count
@@ -404,7 +412,7 @@ class Localizer:
         covariance[POSE] = covariance[:, POSE] = 0.0
         np.fill_diagonal(covariance[POSE, POSE], np.inf)
         of_velocities = replace(prior, covariance=covariance)
-        turned = observed.sighted.turn is not None
+        turned = observed.sighted.rotation is not None
         return with_motion(observed.terms, of_velocities, observed.centre, turned)
 
     def _accept(

@@ -37,7 +37,7 @@ from rs_localizer.core.rig import Rig
 from rs_localizer.core.scanning import ACROSS, REVERSED, ScanDirection
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import ANGULAR, MOTION_PARAMETERS, POSE, TURN, VELOCITIES
-from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.core.types import Estimate, Failure, roughness
 from rs_localizer.estimation.points import find_usable, packed
 from rs_localizer.estimation.prior import state_in
 from rs_localizer.estimation.projection import linearized
@@ -69,7 +69,7 @@ _LIKE_MOTION, _ALIKE = 0.002, math.exp(-1.0 / 30.0)
 # one. A camera that vibrates between its frames moves otherwise within them, or shows a readout
 # that is longer than the interval: 0.1 deg at 11 to 47 Hz make 2 to 600 times, or 60 ms; hands 1.3.
 _LEARNING, _MOST_UNLIKELY, _SHAKEN = 0.1, 4.0, 1.5
-# A gyroscope's rates vibrate if this share of the angular velocity is no parabola of the rows.
+# Rates that are known vibrate if this share of the angular velocity is no parabola of the rows.
 _ROUGH = 0.1
 # A shutter is contradicted beyond this many deviations, if it is also off by more than this share.
 _SURELY, _LEAST_DIFFERENCE = 4.0, 0.06
@@ -430,7 +430,7 @@ class ShutterWatch:
 
 
 def _vibrates(found: Estimate) -> bool:
-    """Return whether points, or a gyroscope, show a vibration within an image."""
-    turn = found.turn
-    rough = turn is not None and turn.roughness > _ROUGH * np.linalg.norm(found.angular_velocity)
-    return bool(rough or len(found.shake))
+    """Return whether a vibration within an image shows."""
+    if not found.aided:
+        return len(found.shake) > 0
+    return bool(roughness(found) > _ROUGH * np.linalg.norm(found.angular_velocity))

@@ -7,10 +7,9 @@ poses a frame apart show it well. The tracker combines both. Its state is one tr
 last frames (:mod:`rs_localizer.estimation.window`). Accelerations fade within an image or
 two while new ones come (Singer, "Estimating optimal tracking filter performance for manned
 maneuvering targets", 1970); their size is learnt. The trajectory predicts each frame and is the
-prior of its maximum a posteriori estimate. What the points add to the prior joins the window. A
-gyroscope, if there is one, replaces the rotation of the motion model
-(:mod:`rs_localizer.inertial.gyro_prior`); the window stays the camera's own, and predicts frames
-that contradict the gyroscope.
+prior of its maximum a posteriori estimate. What the points add to the prior joins the window. An
+aid that reads how the camera turns, if there is one, replaces the rotation of the motion model; the
+window stays the camera's own, and predicts frames that contradict the aid.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,9 +27,9 @@ from numpy.typing import ArrayLike
 from rs_localizer.config import Acceleration, RefinementKind
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray, instance
-from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import ByCamera, Rig, RigEstimate
+from rs_localizer.core.rotation_prior import RotationPrior
 from rs_localizer.core.state import (
     ANGULAR,
     PARAMETERS,
@@ -41,7 +40,8 @@ from rs_localizer.core.state import (
 )
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import ErrorModes
-from rs_localizer.estimation.prior import Prior
+from rs_localizer.estimation.known_rotation import Aid, Foretold, LastFrame
+from rs_localizer.estimation.prior import Prior, beside
 from rs_localizer.estimation.window import (
     FADING,
     LENGTH,
@@ -52,7 +52,6 @@ from rs_localizer.estimation.window import (
     acceleration_covariance,
     estimate_at,
     gaussian_of,
-    mean_turn,
     motion_of,
     predicted_estimate,
     sample_of,
@@ -66,12 +65,6 @@ from rs_localizer.repeated_images import RepeatedImages, coasting
 from rs_localizer.shutter_watch import FAR_OFF, ShutterWatch
 from rs_localizer.solvers.table import find_solver
 
-if TYPE_CHECKING:  # without a gyroscope nobody needs them
-    from rs_localizer.inertial.gyro_prior import Before, GyroPrediction, GyroscopeTrack
-    from rs_localizer.inertial.samples import ImuSamples
-    from rs_localizer.inertial.status import InertialSettings, InertialStatus
-
-
 # After a longer gap (s) a prediction helps less than a fresh search.
 _LONGEST_GAP = 1.0
 # If this many frames in a row are closer than a microsecond, times are seconds or milliseconds.
@@ -81,8 +74,6 @@ _LEAST_STEP_NS, _MOST_TOO_CLOSE = 1000, 3
 _COUNTED, _SINCE_1970 = 1_000_000, ((10**9, 4 * 10**9), (10**12, 4 * 10**12))
 # Weight of the newest frame in the share of inliers of the last frames.
 _NEWEST = 0.3
-# Deviation (s) of a gyroscope's delay that no frames estimate: it is the given one.
-_GIVEN_DELAY = 1e-4
 # Largest squared distance of a searched motion from the track: once in a million by chance.
 _MOST_INNOVATION = 62.0
 # Of the logarithm of the odds of a vibration, the part that the next frame has of it: sizes and
@@ -137,12 +128,10 @@ class Tracker:
         localizer: the localizer of single frames. To remember the motion, its camera must have a
             readout time, because the velocities of one image are per readout. Its solver must be
             for rolling shutters, because a global shutter has no velocities.
-        inertial: settings of a gyroscope whose samples come with the frames of a single camera,
-            which needs a readout time; None: there is none. If the motion is not remembered, the
-            bias may be any that a gyroscope has, and the offset of its stamps is the given one.
+        aid: knows from readings how a single camera with a readout time turns; None: nothing does.
         remembers_motion: whether the motion of a frame predicts the next ones.
         output_lag: frames by which results of :meth:`localize` are delayed, so that later frames
-            improve them; for a single camera without a gyroscope.
+            improve them; for a single camera without an aid.
         max_prediction: longest prediction of :meth:`at` after the last frame, s.
 
     Raises:
@@ -153,7 +142,7 @@ class Tracker:
     def __init__(
         self,
         localizer: Localizer,
-        inertial: InertialSettings | None = None,
+        aid: Aid | None = None,
         remembers_motion: bool = True,
         output_lag: int = 0,
         max_prediction: float = 0.1,
@@ -161,8 +150,8 @@ class Tracker:
         instance("localizer", localizer, Localizer)
         if remembers_motion:
             _check_motion(localizer)
-        elif inertial is not None:
-            inertial = replace(inertial, time_offset_deviation=_GIVEN_DELAY)
+        elif aid is not None:
+            aid.forget_delay()
         if output_lag not in range(LENGTH):
             raise ValueError(f"output_lag must be 0 to {LENGTH - 1} frames, got {output_lag!r}")
         if not 0.0 <= max_prediction < math.inf:
@@ -180,11 +169,9 @@ class Tracker:
         self._errors = PredictionErrors(max_prediction)
         self._last_ns: int | None = None
         self._too_close = 0
-        self._aid: GyroscopeTrack | None = None
-        if inertial is not None:
-            from rs_localizer.inertial.gyro_prior import GyroscopeTrack
-
-            self._aid = GyroscopeTrack(inertial, localizer.camera.readout_time)
+        if aid is not None:
+            self._readout_time = localizer.camera.readout_time
+        self.aid = aid
 
     def reset(self) -> None:
         """Forget all frames so far."""
@@ -195,8 +182,8 @@ class Tracker:
         self._images, self.repeats = RepeatedImages(), False
         self.shutter.reset()
         self.lens.reset()
-        if self._aid is not None:
-            self._aid.reset()
+        if self.aid is not None:
+            self.aid.reset()
 
     def _watch(self) -> ShutterWatch:
         """Return the watch that compares the shutter of a single camera with its motion."""
@@ -204,11 +191,6 @@ class Tracker:
         timed = len(cameras) == 1 and cameras[0].readout_time > 0.0
         watched = timed and find_solver(config.solver).rolling_shutter
         return ShutterWatch(cameras[0] if watched else None, config.inlier_threshold)
-
-    @property
-    def inertial(self) -> InertialStatus | None:
-        """Status of the gyroscope; None without one."""
-        return None if self._aid is None else self._aid.status
 
     def stale(self, points: ArrayLike) -> BoolArray:
         """Return a mask of landmarks (n,3) of a single camera, often seen and never matched."""
@@ -295,7 +277,7 @@ class Tracker:
         except ValueError:  # rounding errors are all that is left of the covariance
             return None
 
-    def at(self, time_ns: int, imu: ImuSamples | None = None) -> Estimate | None:
+    def at(self, time_ns: int, readings: Any = None) -> Estimate | None:
         """Return the motion at a time, in ns as :meth:`localize` takes it.
 
         Within the rows of one of the last frames it is the motion of that frame. Between frames it
@@ -306,8 +288,8 @@ class Tracker:
 
         Args:
             time_ns: the time, ns.
-            imu: samples from before the last frame with a pose until now; after that frame, the
-                camera rotates as they say.
+            readings: of the aid, from before the last frame with a pose until now; after that
+                frame, the camera rotates as they say.
         """
         track = self._track
         if track is None:
@@ -324,7 +306,7 @@ class Tracker:
         seconds = 1e-9 * (time_ns - nearest_ns)
         if abs(seconds) <= 0.5 * nearest.span:
             there = Estimate.at_time(nearest, seconds)
-        elif (turned := self._turned(time_ns, imu)) is not None:
+        elif (turned := self._turned(time_ns, readings)) is not None:
             there = turned
         else:
             motion = window.at(time_ns)
@@ -343,36 +325,34 @@ class Tracker:
         there = copy(self)
         there._seen = deque(map(copy, self._seen), LENGTH)
         there._track, there._errors = copy(self._track), copy(self._errors)
-        if self._aid is not None:
-            there._aid = self._aid.snapshot()
+        if self.aid is not None:
+            there.aid = self.aid.snapshot()
         return there
 
-    def _turned(self, time_ns: int, samples: ImuSamples | None) -> Estimate | None:
-        """Return the motion after the last frame, rotated by a gyroscope; None without samples."""
+    def _turned(self, time_ns: int, readings: Any) -> Estimate | None:
+        """Return the motion after the last frame, rotated by the aid; None without readings."""
         track = self._track
-        if track is None or self._aid is None or not self._aid.agreed or not samples:
+        if track is None or self.aid is None or not self.aid.agreed or not readings:
             return None
         span, half_ns = track.estimate.span, round(0.5e9 * track.estimate.span)
         # The rows of the last frame are known, too.
-        last_ns = max(self._aid.last_ns(samples), track.time_ns + half_ns)
+        last_ns = max(self.aid.last_ns(readings), track.time_ns + half_ns)
         seen_ns = min(time_ns, last_ns)
         # The middle of a frame whose last row would be there.
         middle_ns = min(time_ns, last_ns - half_ns)
         if middle_ns < track.time_ns or time_ns > last_ns + half_ns:
             return None
-        from rs_localizer.inertial.gyro_prior import changed
-
         last = track.estimate
         if middle_ns > track.time_ns:
             before = self._before(middle_ns)
-            known = None if before is None else self._aid.ahead(samples, middle_ns, before)
+            known = None if before is None else self.aid.ahead(readings, middle_ns, before)
             if known is None:
                 return None
             last = known.of(last)
         there = last.at_time(1e-9 * (seen_ns - middle_ns))
         if (unseen := 1e-9 * (time_ns - seen_ns)) > 0.0:
-            there, variance = there.at_time(unseen), changed(samples, unseen)
-            added = acceleration_covariance(self._beside_gyro(track), unseen, span)
+            there, variance = there.at_time(unseen), self.aid.changed(readings, unseen)
+            added = acceleration_covariance(self._beside_aid(track), unseen, span)
             added[ANGULAR, ANGULAR] += span**2 * variance * np.eye(3)
             added[TURN, TURN] += unseen**2 * variance * np.eye(3)
             there = replace(there, joint_covariance=there.joint_covariance + added)
@@ -401,7 +381,7 @@ class Tracker:
         pixels: ArrayLike | None = None,
         scores: ArrayLike | None = None,
         *,
-        imu: ImuSamples | None = None,
+        readings: Any = None,
         stamps: Mapping[str, float] | None = None,
         context: FrameContext = ORDINARY,
     ) -> Estimate | Failure:
@@ -413,8 +393,8 @@ class Tracker:
         they are refused. :attr:`repeats` is then true.
 
         Args:
-            imu: samples from before the last frame with a pose, if there are any, until after the
-                exposure of this one; None: the camera goes alone.
+            readings: of the aid, from before the last frame with a pose, if there are any, until
+                after the exposure of this one; None: the camera goes alone.
             stamps: of a rig, s after ``time_ns`` at which the first rows were exposed (None: then);
                 the time of the estimate counts from there, too.
             context: what else is known of this frame.
@@ -428,23 +408,23 @@ class Tracker:
             time_ns += later
             if not self._follows(time_ns):
                 self._track = None
-        elif self._aid is not None:
-            self._aid.reset()
-        again = self._again(time_ns, points, pixels, imu)
+        elif self.aid is not None:
+            self.aid.reset()
+        again = self._again(time_ns, points, pixels, readings)
         if again is not None:
             self._keep(_Seen(time_ns, again, points, pixels, stamps))
             return self.delayed
         share = 0.0 if self._track is None else self._track.share
 
-        def find(prior: Prior | None, turn: GyroRotation | None = None) -> Estimate | Failure:
+        def find(prior: Prior | None, rotation: RotationPrior | None = None) -> Estimate | Failure:
             return self.localizer.find(
-                points, pixels, scores, prior, share, turn, stamps, context.error_modes
+                points, pixels, scores, prior, share, rotation, stamps, context.error_modes
             )
 
         foreseen = None
-        if self._aid is not None:
-            foreseen = self._aid.foresee(imu, time_ns, self._before(time_ns))
-        result, prior = self._fitted(time_ns, foreseen, span, context, find)
+        if self.aid is not None:
+            foreseen = self.aid.foresee(readings, time_ns, self._before(time_ns))
+        result, prior, rotation = self._fitted(time_ns, foreseen, span, context, find)
         if pixels is not None:  # of a camera alone
             jumped = self._has_jumped(time_ns, prior, result)
             seen = np.asarray(points, float), np.asarray(pixels, float)
@@ -454,45 +434,45 @@ class Tracker:
             result = self.shutter.widened(self._judged(result, points, pixels, prior))
             if self.remembers_motion:
                 result = self._covering(replace(result, time_ns=time_ns), context)
-                self._remember(time_ns, prior, result, context)
+                self._remember(time_ns, prior, rotation, result, context)
         self._keep(_Seen(time_ns, result, points, pixels, stamps))
         self._images.add(time_ns, points, pixels)
         self._publish()
         return self.delayed
 
     def _fitted(
-        self, time_ns: int, foreseen: GyroPrediction | None, span: float | None,
+        self, time_ns: int, foreseen: Foretold | None, span: float | None,
         context: FrameContext,
-        find: Callable[[Prior | None, GyroRotation | None], Estimate | Failure],
-    ) -> tuple[Estimate | Failure, Prior | None]:  # fmt: skip
-        """Find the frame beside what a gyroscope knows, or without what its points contradict.
+        find: Callable[[Prior | None, RotationPrior | None], Estimate | Failure],
+    ) -> tuple[Estimate | Failure, Prior | None, RotationPrior | None]:  # fmt: skip
+        """Find the frame beside what the aid knows, or without what its points contradict.
 
         Returns:
-            what was found, and the prior that it was found with.
+            what was found, and both priors that it was found with.
         """
         alone = self._prior(time_ns, None, span, context)
-        if foreseen is None or self._aid is None:
-            return find(alone, None), alone
-        turn = foreseen.turn
-        prior = foreseen.prior or self._prior(time_ns, turn, span, context)
-        found = find(prior, turn)
-        if found and self._aid.agrees(foreseen, found, self._told(found, prior, foreseen)):
-            return found, prior
+        if foreseen is None or self.aid is None:
+            return find(alone, None), alone, None
+        rotation = foreseen.rotation
+        prior = foreseen.prior or self._prior(time_ns, rotation, span, context)
+        found = find(prior, rotation)
+        if found and self.aid.agrees(foreseen, found, self._told(found, prior, foreseen)):
+            return found, prior, rotation
         other = find(alone, None)
         if other and not found:
-            self._aid.agrees(foreseen, other, self._told(other, alone, foreseen))
-        return (other, alone) if other else (found, prior)
+            self.aid.agrees(foreseen, other, self._told(other, alone, foreseen))
+        return (other, alone, None) if other else (found, prior, rotation)
 
-    def _told(self, found: Estimate, prior: Prior | None, foreseen: GyroPrediction) -> MotionSample:
-        """Return what the points of a frame tell of its motion beside a gyroscope's turn."""
-        near = prior if found.tracked else None
-        known = self.localizer.known_of(near, found.span, found.turn)
-        told = told_of(found, known)
-        if found.turn is not None:
-            return told
+    def _told(self, found: Estimate, prior: Prior | None, foreseen: Foretold) -> MotionSample:
+        """Return what the points of a frame tell of its motion beside the known rotation."""
+        near, rotation = prior if found.tracked else None, foreseen.rotation
+        if found.aided:
+            known = self.localizer.known_of(near, found.span, rotation)
+            return told_of(rotation.beside(found), known)
+        told = told_of(found, self.localizer.known_of(near, found.span))
         state = told.state.copy()
-        state[STATE_ANGULAR] -= mean_turn(foreseen.turn)[0]
-        state[STATE_ANGULAR_ACCELERATION] -= foreseen.turn.parabola[1]
+        state[STATE_ANGULAR] -= rotation.smooth_rate
+        state[STATE_ANGULAR_ACCELERATION] -= rotation.change
         return told._replace(state=state)
 
     def _keep(self, seen: _Seen) -> None:
@@ -504,7 +484,7 @@ class Tracker:
         self._seen.append(seen)
 
     def _again(
-        self, time_ns: int, points: Any, pixels: Any, imu: ImuSamples | None
+        self, time_ns: int, points: Any, pixels: Any, readings: Any
     ) -> Estimate | Failure | None:
         """Return the result of a frame that repeats the last image; None if it does not.
 
@@ -514,7 +494,7 @@ class Tracker:
         copies = self._images.copies(points, pixels) if self.newest_ns != time_ns else []
         self.repeats, track = bool(copies), self._track
         if copies and track is not None:
-            prior = self._foreseen(time_ns, imu)
+            prior = self._foreseen(time_ns, readings)
             rig, last = self.localizer.rig, track.estimate
             self._images.judge(copies, rig, last, track.time_ns, prior)
         if stale := self._images.stale(copies):
@@ -529,12 +509,12 @@ class Tracker:
             return None
         return replace(found, time_ns=time_ns) if self.remembers_motion else found
 
-    def _foreseen(self, time_ns: int, imu: ImuSamples | None) -> Prior | None:
-        """Predict the motion of a possible copy: by gyroscope, last velocities, or others."""
+    def _foreseen(self, time_ns: int, readings: Any) -> Prior | None:
+        """Predict the motion of a possible copy: by aid, last velocities, or others."""
         track = self._track
-        if self._aid is not None and self._aid.agreed and imu:
+        if self.aid is not None and self.aid.agreed and readings:
             before = self._before(time_ns)
-            known = None if before is None else self._aid.ahead(imu, time_ns, before)
+            known = None if before is None else self.aid.ahead(readings, time_ns, before)
             if known is not None:
                 return known.prior
         if track is None or track.window is None:
@@ -568,7 +548,7 @@ class Tracker:
             return
         known = {time_ns: k for k, time_ns in enumerate(reversed(window.times))}
         for seen in list(self._seen)[-1 - self.output_lag :]:
-            own = isinstance(seen.found, Estimate) and seen.found.turn is None
+            own = isinstance(seen.found, Estimate) and not seen.found.aided
             if own and seen.time_ns in known:
                 seen.found = self._published(seen, window.before(known[seen.time_ns]))
 
@@ -610,22 +590,21 @@ class Tracker:
         return replace(result, integrity=self._integrity.add(numbers))
 
     def _prior(
-        self, time_ns: int, turn: GyroRotation | None, span: float | None, context: FrameContext
-    ) -> Prior | None:
-        """Return the prior of a frame for which a gyroscope predicts only the rotation."""
+        self, time_ns: int, rotation: RotationPrior | None, span: float | None,
+        context: FrameContext,
+    ) -> Prior | None:  # fmt: skip
+        """Return the prior of a frame for which an aid predicts only the rotation."""
         if not self.remembers_motion:
-            return Prior(of_rest=self.shutter.of_rest) if turn is None else None
+            return Prior(of_rest=self.shutter.of_rest) if rotation is None else None
         prior = self.prediction(time_ns, span, context)
         if prior is not None and not self._trusts_motion(context):
-            rest = self.shutter.of_rest if turn is None else 0.0
+            rest = self.shutter.of_rest if rotation is None else 0.0
             prior = replace(prior, covariance=_UNKNOWN, of_rest=rest)
-        if turn is None:
+        if rotation is None:
             if prior is not None and self._track is not None:
                 prior = replace(prior, of_vibration=self._track.vibrations)
             return prior
-        from rs_localizer.inertial.gyro_prior import without_gyro
-
-        return without_gyro(prior, turn)
+        return None if prior is None else beside(prior, rotation)
 
     def _published(self, seen: _Seen, motion: Gaussian) -> Estimate:
         """Return the estimate of one of the last frames with this motion, and its residuals."""
@@ -638,24 +617,25 @@ class Tracker:
         return replace(found, residuals=residuals, inliers=residuals <= seen.gate)
 
     def _remember(
-        self, time_ns: int, prior: Prior | None, result: Estimate, context: FrameContext
-    ) -> None:
+        self, time_ns: int, prior: Prior | None, rotation: RotationPrior | None,
+        result: Estimate, context: FrameContext,
+    ) -> None:  # fmt: skip
         """Keep what the next frames are to know of this one."""
         track, share = self._track, float(np.mean(result.inliers))
         if track is not None and result.tracked:
             share = (1.0 - _NEWEST) * track.share + _NEWEST * share
-        window = self._window(time_ns, prior, result, track, context)
+        window = self._window(time_ns, prior, rotation, result, track, context)
         vibrations = result.vibrations
         if track is not None and track.vibrations.size:
-            # Beside a gyroscope they are of another kind: of what it leaves.
-            is_new = vibrations.size and result.turn is None
+            # Beside an aid they are of another kind: of what it leaves.
+            is_new = vibrations.size and not result.aided
             vibrations = track.vibrations + (vibrations if is_new else 0.0)
         self._track = _Track(result, time_ns, share, window, _REMEMBERED * vibrations)
         self._errors.add(result, window, unshaken(result)[2])
 
     def _window(
-        self, time_ns: int, prior: Prior | None, result: Estimate, track: _Track | None,
-        context: FrameContext,
+        self, time_ns: int, prior: Prior | None, rotation: RotationPrior | None,
+        result: Estimate, track: _Track | None, context: FrameContext,
     ) -> MotionWindow:  # fmt: skip
         """Return a window of the last frames and this one; if it denies them, of this one alone."""
         share = self.readout_time_deviation(context) / result.span
@@ -670,30 +650,28 @@ class Tracker:
             return alone
         near = prior if result.tracked else None
         try:
-            known = self.localizer.known_of(near, result.span, result.turn)
-            sample = sample_of(result, time_ns, known)
+            known = self.localizer.known_of(near, result.span, rotation)
+            sample = sample_of(result, time_ns, known, rotation)
             window = replace(window, readout_share=share).joined(sample)
         except np.linalg.LinAlgError:  # rounding errors are all that is left of a covariance
             return alone
         return window if window.surprise < _MOST_INNOVATION else alone  # NaN is neither
 
-    def _beside_gyro(self, track: _Track) -> Acceleration:
-        """Return the accelerations beside the rotation that a gyroscope measures."""
+    def _beside_aid(self, track: _Track) -> Acceleration:
+        """Return the accelerations beside the rotation that an aid reads."""
         linear = max(float(track.window.deviations[3]), _LEAST_ACCELERATION)
         return Acceleration(_LEAST_ACCELERATION, linear)
 
-    def _before(self, time_ns: int) -> Before | None:
-        """Return what the last frame knows of the motion beside the gyroscope's rotation."""
+    def _before(self, time_ns: int) -> LastFrame | None:
+        """Return what the last frame knows of the motion beside the rotation that an aid reads."""
         track = self._track
         if track is None:
             return None
-        from rs_localizer.inertial.gyro_prior import Before
-
-        readout_time = self.localizer.camera.readout_time
-        motion, covariance, added, _ = unshaken(track.estimate)
-        dt = 1e-9 * (time_ns - track.time_ns)
-        added += acceleration_covariance(self._beside_gyro(track), dt, readout_time)
-        return Before(track.time_ns, motion, covariance, added, FADING / readout_time)
+        readout_time = self._readout_time
+        motion, dt = track.estimate, 1e-9 * (time_ns - track.time_ns)
+        covariance = motion.joint_covariance[:PARAMETERS, :PARAMETERS]
+        added = acceleration_covariance(self._beside_aid(track), dt, readout_time)
+        return LastFrame(track.time_ns, motion, covariance, added, FADING / readout_time)
 
 
 def _check_motion(localizer: Localizer) -> None:

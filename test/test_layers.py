@@ -36,7 +36,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "repeated_images": {"core", "estimation"},
     "lens_watch": {"core"},
     "shutter_watch": {"core", "estimation"},
-    "tracking": METHOD - {"tracking"},
+    "tracking": METHOD - {"tracking", "inertial"},
     "io": {"core"},
     "settings": {"config", "io"},
     "readout": {"data"},

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 import rs_localizer as rsl
 from rs_localizer.core.shutter import Motion
 from rs_localizer.estimation.prior import Prior
+from rs_localizer.inertial.gyro_prior import GyroscopeTrack
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.status import InertialSettings
 from rs_localizer.repeated_images import displacement
@@ -143,9 +144,9 @@ def test_a_gyroscope_tells_a_resting_image_from_a_hanging_one():
     times = np.arange(10) / 20.0
 
     def run(rate):
-        tracker = Tracker(
-            rsl.Localizer(CAMERA), InertialSettings(1e-4, 1e-5, time_offset_deviation=1e-3)
-        )
+        settings = InertialSettings(1e-4, 1e-5, time_offset_deviation=1e-3)
+        aid = GyroscopeTrack(settings, CAMERA.readout_time)
+        tracker = Tracker(rsl.Localizer(CAMERA), aid)
         stamps = np.arange(ns(-1.0), ns(1.0), 2_000_000)
         found = []
         for k, t in enumerate(times):
@@ -155,7 +156,7 @@ def test_a_gyroscope_tells_a_resting_image_from_a_hanging_one():
             until = stamps < ns(t + 0.03)
             samples = ImuSamples(stamps[until], turning[until])
             frame = shown(still, 0.0, 0.3, min(k, 4))
-            found.append(bool(tracker.localize(ns(t), *frame, imu=samples)))
+            found.append(bool(tracker.localize(ns(t), *frame, readings=samples)))
         return found
 
     assert run(0.0) == [True] * 10

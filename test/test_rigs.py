@@ -20,6 +20,7 @@ from benchmarks.independent.rigs import Mounted, Scene, middle_of, views
 from benchmarks.independent.rotations import exponential, logarithm
 from rs_localizer.config import CalibrationErrors
 from rs_localizer.core.types import Estimate
+from rs_localizer.inertial.gyro_prior import GyroscopeTrack
 from rs_localizer.inertial.status import InertialSettings
 
 UPRIGHT, TURNED = np.eye(3), np.diag([-1.0, -1.0, 1.0])
@@ -226,4 +227,4 @@ def test_tracking_carries_a_rig_from_frame_to_frame():
         assert result.tracked == (frame > 0)
     assert np.all(np.mean(tracked, axis=0)[:2] < 0.7 * np.mean(alone, axis=0)[:2])
     with pytest.raises(ValueError, match="several cameras"):
-        rsl.Tracker(localizer, InertialSettings(1e-3, 1e-4))
+        rsl.Tracker(localizer, GyroscopeTrack(InertialSettings(1e-3, 1e-4), 0.03))

@@ -149,7 +149,7 @@ def judge(condition: Condition, frames: int, seed: int, settings: Mapping[str, A
             localize, first = trackers[variant].localize, (frame.middle_ns,)
         readout = localizers[variant].camera.readout_time
         known: dict[str, Any] = (
-            {} if frame.gyroscope is None else {"turn": _turn(frame.gyroscope, readout)}
+            {} if frame.gyroscope is None else {"rotation": _rotation(frame.gyroscope, readout)}
         )
         start = time.process_time()
         try:
@@ -212,15 +212,22 @@ def _with(config: Any, name: str, value: Any) -> Any:
     return replace(config, **{own: changed})  # type: ignore[type-var]
 
 
-def _turn(gyroscope: Gyroscope, readout: float) -> Any:
-    from rs_localizer.core.gyro_rotation import GyroRotation
+# ns; and a delay (s), scales and a mount (rad) that are known.
+_MIDDLE_NS, _EXACT = 10**12, 1e-6
 
-    noise = readout * gyroscope.rate_deviation
-    # Of a line through the samples of one readout.
-    mean = noise**2 * float(np.mean(np.diff(gyroscope.tau)))
-    constant = mean + (readout * gyroscope.bias_deviation) ** 2
-    error = np.diag(np.repeat([constant, 12.0 * mean], 3))
-    return GyroRotation.of(gyroscope.tau, readout * gyroscope.rates, error, noise)
+
+def _rotation(gyroscope: Gyroscope, readout: float) -> Any:
+    from rs_localizer.inertial.gyro_prior import rotation_by
+    from rs_localizer.inertial.samples import ImuSamples
+    from rs_localizer.inertial.turning import GyroscopeErrors, read
+
+    stamps = _MIDDLE_NS + np.rint(1e9 * readout * gyroscope.tau).astype(np.int64)
+    period = readout * float(np.mean(np.diff(gyroscope.tau)))
+    known = np.diag(np.repeat([gyroscope.bias_deviation, *3 * [_EXACT]], [3, 1, 3, 3]) ** 2)
+    errors = GyroscopeErrors(np.zeros(10), known, gyroscope.rate_deviation * math.sqrt(period))
+    found = read(ImuSamples(stamps, gyroscope.rates), _MIDDLE_NS, readout, errors)
+    assert found is not None
+    return rotation_by(found, errors)
 
 
 def _scored(result: Any, frame: Frame, condition: Condition) -> list[float]:

@@ -28,6 +28,7 @@ from benchmarks.real.recordings import Frame, Recording
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate
+from rs_localizer.inertial.gyro_prior import GyroscopeTrack
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.status import InertialSettings
 from rs_localizer.io.trajectories import read_tum, split_at_gaps
@@ -216,15 +217,16 @@ def at_any_time(
     """``Tracker.at`` within rows, between images and ahead; beside poses held, and moved on as the
     last image moved. A gyroscope's samples come some milliseconds late.
     """
-    inertial = InertialSettings(_GYROSCOPE_NOISE, _GYROSCOPE_NOISE)
+    settings = InertialSettings(_GYROSCOPE_NOISE, _GYROSCOPE_NOISE)
     camera = recording.camera
-    tracker = Tracker(Localizer(camera), None if samples is None else inertial)
+    aid = None if samples is None else GyroscopeTrack(settings, camera.readout_time)
+    tracker = Tracker(Localizer(camera), aid)
     found: dict[str, list[tuple[int, Estimate]]] = {}
     before: Estimate | None = None
     half = round(0.5e9 * camera.readout_time)
     for each in recording.frames:
         imu = _until(samples, each.middle_ns + half + 5 * _LATENCY_NS)
-        one = tracker.localize(each.middle_ns, each.points, each.pixels, imu=imu)
+        one = tracker.localize(each.middle_ns, each.points, each.pixels, readings=imu)
         if not one:
             continue
         asked = [("within rows", half * k // 8) for k in range(-8, 9)]

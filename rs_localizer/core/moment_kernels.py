@@ -9,37 +9,31 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, Array2
 from rs_localizer.core.blocks import add_block
-from rs_localizer.core.gyro_rotation import Turning, find_turn, late_at
-from rs_localizer.core.rate_spline import change_at
 from rs_localizer.core.shake import FUNCTIONS, shake_basis
 from rs_localizer.core.shutter import Numbers
 from rs_localizer.core.state import PARAMETERS
-from rs_localizer.native import entry, inlined, kernel
+from rs_localizer.native import entry, kernel
 
 
 @entry
 def pose_of(
-    motion: Numbers, shake: Array2, joint: Array2, turn: Turning, tau: float, beyond: float
+    motion: Numbers, shake: Array2, joint: Array2, tau: float, beyond: float
 ) -> tuple[Array, Array, Array]:
     """Return position (3,), rotation (3,3) map_from_camera, and covariance (6,6), position first.
 
     Args:
-        motion: at the middle row, with the known turn.
+        motion: at the middle row.
         shake: (k,3) coefficients.
         joint: (18 + 3 k,18 + 3 k) covariance of motion and coefficients.
-        turn: rotation by a gyroscope.
         tau: row time.
         beyond: variance of the turn (rad^2) that no row has seen.
     """
     rotation, translation, angular, linear, change, acceleration = motion
-    angle = tau * (angular - turn.rate) + 0.5 * tau * tau * (change - turn.change)
+    angle = tau * angular + 0.5 * tau * tau * change
     displacement = tau * linear + 0.5 * tau * tau * acceleration
     map_from_middle = np.ascontiguousarray(rotation.T)
     values, _, turned, _ = _shaken(shake, tau, max(_columns(joint), len(shake)))
-    gyro_turn, rate = np.empty((3, 3)), np.empty(3)
-    find_turn(tau, turn.tau, turn.rates, turn.rotations, turn.parabola, gyro_turn, rate)
-    map_from_swing = map_from_middle @ so3.exp(angle) @ so3.exp(turned)  # as if not turned beside
-    map_from_then = map_from_swing @ np.ascontiguousarray(gyro_turn.T)
+    map_from_then = map_from_middle @ so3.exp(angle) @ so3.exp(turned)
     by_angle = map_from_middle @ so3.right_jacobian_of(-angle)
     jacobian = np.zeros((6, len(joint)))
     add_block(jacobian, 0, 0, -1.0, map_from_middle @ so3.hat_of(displacement))
@@ -50,41 +44,31 @@ def pose_of(
     add_block(jacobian, 3, 6, tau, by_angle)
     add_block(jacobian, 3, 12, 0.5 * tau * tau, by_angle)
     for k in range(_columns(joint)):
-        add_block(jacobian, 3, PARAMETERS + 3 * k, values[k], map_from_swing)
+        add_block(jacobian, 3, PARAMETERS + 3 * k, values[k], map_from_then)
     covariance = _propagated(jacobian, joint)
-    late = turn.delay * (map_from_then @ late_at(tau, turn.tau, turn.rates, turn.parabola)[0])
     for i in range(3):
-        for j in range(3):
-            covariance[3 + i, 3 + j] += late[i] * late[j]
         covariance[3 + i, 3 + i] += beyond
     return map_from_middle @ (displacement - translation), map_from_then, covariance
 
 
 @entry
 def twist_of(
-    motion: Numbers, shake: Array2, joint: Array2, turn: Turning, tau: float,
-    beyond: tuple[float, float],
-) -> tuple[Array, Array, Array]:  # fmt: skip
+    motion: Numbers, shake: Array2, joint: Array2, tau: float, beyond: tuple[float, float]
+) -> tuple[Array, Array, Array]:
     """Return linear and angular velocity (3,) per readout, camera axes, and covariance (6,6).
 
     Args:
-        motion, shake, joint, turn, tau: as of :func:`pose_of`.
+        motion, shake, joint, tau: as of :func:`pose_of`.
         beyond: variances of the turn (rad^2) and its rate that no row has seen.
     """
-    _, _, angular_velocity, linear_velocity, change, acceleration = motion
-    rate, change = angular_velocity - turn.rate, change - turn.change
+    _, _, rate, linear_velocity, change, acceleration = motion
     angle = tau * rate + 0.5 * tau * tau * change
     values, rates, turned, swing = _shaken(shake, tau, max(_columns(joint), len(shake)))
-    gyro_turn, gyro_rate = np.empty((3, 3)), np.empty(3)
-    find_turn(tau, turn.tau, turn.rates, turn.rotations, turn.parabola, gyro_turn, gyro_rate)
-    unshaken = so3.exp(-turned)
-    beside = gyro_turn @ unshaken
+    beside, unit = so3.exp(-turned), np.eye(3)
     back, by_angle = so3.exp(-angle), so3.right_jacobian_of(angle)
     linear = beside @ (back @ (linear_velocity + tau * acceleration))
-    body_rate = unshaken @ (by_angle @ (rate + tau * change))
-    swinging = gyro_turn @ (
-        body_rate + so3.right_jacobian_of(turned) @ swing
-    )  # without the known rate
+    body_rate = beside @ (by_angle @ (rate + tau * change))
+    angular = body_rate + so3.right_jacobian_of(turned) @ swing
     by_turn = beside @ back
     by_rate = so3.hat_of(linear) @ (beside @ by_angle)
     by_acceleration = 0.5 * tau * (beside @ (np.eye(3) + by_angle))
@@ -95,47 +79,19 @@ def twist_of(
     add_block(jacobian, 0, 15, tau, by_turn)
     add_block(jacobian, 3, 6, 1.0, beside)
     add_block(jacobian, 3, 12, 1.0, by_acceleration)
-    linear_by_shake = so3.hat_of(linear) @ gyro_turn
-    angular_by_shake = so3.hat_of(swinging) @ gyro_turn
+    across, angular_by_shake = so3.hat_of(linear), so3.hat_of(angular)
     for k in range(_columns(joint)):
         place = PARAMETERS + 3 * k
-        add_block(jacobian, 0, place, values[k], linear_by_shake)
-        add_block(jacobian, 3, place, rates[k], gyro_turn)
+        add_block(jacobian, 0, place, values[k], across)
+        add_block(jacobian, 3, place, rates[k], unit)
         add_block(jacobian, 3, place, values[k], angular_by_shake)
     covariance = _propagated(jacobian, joint)
-    late = turn.delay * late_at(tau, turn.tau, turn.rates, turn.parabola)[1]
-    across = so3.hat_of(linear)
     for i in range(3):
         for j in range(3):
-            covariance[3 + i, 3 + j] += late[i] * late[j]
             for k in range(3):
                 covariance[i, j] += beyond[0] * across[i, k] * across[j, k]
-        covariance[3 + i, 3 + i] += turn.rate_noise * turn.rate_noise + beyond[1]
-    angular = swinging + gyro_rate
-    if _better_known(turn, tau, covariance):
-        angular = gyro_rate
+        covariance[3 + i, 3 + i] += beyond[1]
     return linear, angular, covariance
-
-
-@inlined
-def _better_known(turn: Turning, tau: float, covariance: Array) -> bool:
-    """Return True if the gyroscope alone knows the rate better; the covariance is then its own."""
-    if not turn.tau[0] <= tau <= turn.tau[-1]:
-        return False
-    late = turn.delay * change_at(tau, turn.tau, turn.rates)
-    own, all_in_all = 0.0, 0.0
-    for i in range(3):
-        own += turn.rate_error[i, i] + turn.rate_noise * turn.rate_noise + late[i] * late[i]
-        all_in_all += covariance[3 + i, 3 + i]
-    if not own < all_in_all:
-        return False
-    covariance[3:6] = 0.0
-    covariance[0:3, 3:6] = 0.0
-    for i in range(3):
-        for j in range(3):
-            covariance[3 + i, 3 + j] = turn.rate_error[i, j] + late[i] * late[j]
-        covariance[3 + i, 3 + i] += turn.rate_noise * turn.rate_noise
-    return True
 
 
 @kernel

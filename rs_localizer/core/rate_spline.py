@@ -21,32 +21,11 @@ from rs_localizer.native import entry, kernel
 
 
 @kernel
-def rate_at(time: float, times: Array, cubics: Array) -> Array:
-    place, rate = place_of(time, times), np.empty(3)
-    rate_in(cubics[place], time - times[place], rate)
-    return rate
-
-
-@kernel
 def rate_in(cubic: Array, since: float, rate: Array) -> None:
     for axis in range(3):
         rate[axis] = cubic[0, axis] + since * (
             cubic[1, axis] + since * (cubic[2, axis] + since * cubic[3, axis])
         )
-
-
-@kernel
-def change_at(time: float, times: Array, cubics: Array) -> Array:
-    """Return the derivative (3,) of a spline of rates at a time."""
-    place = place_of(time, times)
-    since = time - times[place]
-    change = np.empty(3)
-    for axis in range(3):
-        cubic = cubics[place]
-        change[axis] = cubic[1, axis] + since * (
-            2.0 * cubic[2, axis] + 3.0 * since * cubic[3, axis]
-        )
-    return change
 
 
 @entry

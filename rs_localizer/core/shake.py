@@ -47,6 +47,14 @@ def _resolved() -> tuple[Array, Array]:
 COMBINATIONS, IN_COMBINATIONS = _resolved()
 
 
+def shake_functions(tau: Array) -> tuple[Array, Array]:
+    """Return :func:`shake_basis` at row times (n,) without kernels: values and rates (n,28)."""
+    angle = np.asarray(tau)[:, None] * RATES
+    values = np.stack([np.cos(angle) - 1.0, np.sin(angle) - angle], axis=2)
+    rates = RATES[:, None] * np.stack([-np.sin(angle), np.cos(angle) - 1.0], axis=2)
+    return values.reshape(-1, FUNCTIONS), rates.reshape(-1, FUNCTIONS)
+
+
 @entry
 def shake_basis(tau: float, values: Out[Array1], rates: Out[Array1]) -> None:
     """Fill in ``cos(w tau) - 1`` and ``sin(w tau) - w tau`` of each frequency, and their rates.

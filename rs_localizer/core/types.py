@@ -12,7 +12,6 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
-from rs_localizer.core.gyro_rotation import GyroRotation, late_at
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shake import FUNCTIONS, shake_at, shake_basis, within_rows
 from rs_localizer.core.shutter import Motion, carried, numbers_of
@@ -24,6 +23,7 @@ _NO_FADING = 1e9
 
 # Row times at which the rate of the vibration is sampled.
 _ROWS = np.linspace(-0.5, 0.5, 17)
+_PARABOLAS = np.vander(_ROWS, 3) @ np.linalg.pinv(np.vander(_ROWS, 3))
 # Pixels at the rim lie a little beyond the first and the last row.
 _LAST_ROW = 0.55
 
@@ -64,8 +64,7 @@ class Estimate(Motion):
     declared_error: float = 0.0  # px, the part of it that map and calibration are declared to have
     tracked: bool = False  # found near a prior motion, without a search
     time_ns: int = 0  # of a tracker: when the middle row was exposed
-    # Rotation of the camera by a gyroscope; velocities and accelerations include it
-    turn: GyroRotation | None = None
+    aided: bool = False  # more than the points tells of the rotation within the frame
     span: float = 0.0  # s, duration of one unit of row time; 0: unknown
     # Probability that the pose lies outside its region or the map is another one; NaN: not judged
     integrity: float = math.nan
@@ -112,23 +111,9 @@ class Estimate(Motion):
         turn = shake_at(np.array([within_rows(tau)]), self.shake)[0]
         return turn[:3], turn[3:] if tau == within_rows(tau) else np.zeros(3)
 
-    def without_gyro(self) -> Motion:
-        """Return the motion without the gyroscope's rotation."""
-        if self.turn is None:
-            return self
-        return Motion(
-            self.rotation,
-            self.translation,
-            self.angular_velocity - self.turn.rate,
-            self.linear_velocity,
-            angular_acceleration=self.angular_acceleration - self.turn.change,
-            linear_acceleration=self.linear_acceleration,
-        )
-
     def turned_beside(self, tau: float) -> Array:
-        """Return the rotation (3,3) at ``tau`` beside the motion, by gyroscope and vibration."""
-        shaken = so3.exp(-self.shake_at(tau)[0])
-        return shaken if self.turn is None else self.turn.at(tau)[0] @ shaken
+        """Return the rotation (3,3) by which the camera is turned beside that motion at ``tau``."""
+        return so3.exp(-self.shake_at(tau)[0])
 
     def at(self, tau: float) -> tuple[Array, Array]:
         """Return the rotation (3,3) and translation (3,) camera_from_map at row time ``tau``.
@@ -146,35 +131,29 @@ class Estimate(Motion):
 
     def _at(self, tau: float) -> tuple[Array, Array]:
         # By the class: super() fails in a dataclass with slots, and self.at is overridden.
-        rotation, translation = Motion.at(self.without_gyro(), tau)
+        rotation, translation = Motion.at(self, tau)
         turned = self.turned_beside(tau)
         return turned @ rotation, turned @ translation
 
     def at_rows(self, tau: Array) -> tuple[Array, Array]:
         """Return the rotations (n,3,3) and translations (n,3) camera_from_map at row times (n,)."""
-        rotations, translations = Motion.at_rows(self.without_gyro(), tau)
-        if self.turn is None and not len(self.shake):
+        rotations, translations = Motion.at_rows(self, tau)
+        if not len(self.shake):
             return rotations, translations
         turns = shake_at(np.clip(np.asarray(tau, float), -0.5, 0.5), self.shake)
         turned = so3.exp_many(-turns[:, :3])
-        if self.turn is not None:
-            turned = self.turn.at_rows(tau)[0] @ turned
         return turned @ rotations, np.einsum("nij,nj->ni", turned, translations)
 
     def angular_velocity_at(self, tau: float) -> Array:
         """Return the body rate (3,), rad per readout, in the camera axes at ``tau``."""
         turn, rate = self.shake_at(tau)
-        body_rate = so3.exp(-turn) @ Motion.angular_velocity_at(self.without_gyro(), tau)
+        body_rate = so3.exp(-turn) @ Motion.angular_velocity_at(self, tau)
         shaken: Array = body_rate + so3.right_jacobian(turn) @ rate
-        if self.turn is None:
-            return shaken
-        rotation, gyro_rate = self.turn.at(tau)
-        turned: Array = rotation @ shaken + gyro_rate
-        return turned
+        return shaken
 
     def linear_velocity_at(self, tau: float) -> Array:
         """Return the velocity (3,) of the centre, m per readout, in the camera axes at ``tau``."""
-        velocity = Motion.linear_velocity_at(self.without_gyro(), tau)
+        velocity = Motion.linear_velocity_at(self, tau)
         turned: Array = self.turned_beside(tau) @ velocity
         return turned
 
@@ -189,8 +168,7 @@ class Estimate(Motion):
         if not (math.isfinite(seconds) and self.span > 0.0):
             raise ValueError(f"needs finite seconds and a span, got {seconds!r} and {self.span}")
         tau = seconds / self.span
-        beside = numbers_of(self.without_gyro())
-        later, transport = carried(beside, tau, _NO_FADING)
+        later, transport = carried(numbers_of(self), tau, _NO_FADING)
         rotation, translation = self._at(tau)
         values, rates = np.zeros(FUNCTIONS), np.zeros(FUNCTIONS)
         shake_basis(within_rows(tau), values, rates)
@@ -207,11 +185,6 @@ class Estimate(Motion):
         joint = transport @ self.joint_covariance @ transport.T
         for part, variance in zip((TURN, ANGULAR), beyond_rows(self, tau), strict=True):
             joint[part, part] += variance * np.eye(3)
-        if self.turn is not None:  # its delay and its noise at this moment
-            late = late_at(tau, self.turn.tau, self.turn.rates, self.turn.parabola)
-            for part, off in zip((TURN, ANGULAR), late, strict=True):
-                joint[part, part] += self.turn.delay**2 * np.outer(off, off)
-            joint[ANGULAR, ANGULAR] += self.turn.rate_noise**2 * np.eye(3)
         return replace(
             self,
             rotation=rotation,
@@ -224,7 +197,6 @@ class Estimate(Motion):
             calibration_covariance=shared @ self.calibration_covariance @ shared.T,
             undetected_covariance=shared @ self.undetected_covariance @ shared.T,
             shake=np.zeros((0, 3)),
-            turn=None,
             time_ns=self.time_ns + round(1e9 * seconds),
         )
 
@@ -265,24 +237,20 @@ def beyond_rows(estimate: Estimate, tau: float) -> tuple[float, float]:
     """Return variances of the rotation (rad^2) and its rate, per readout, outside of the rows.
 
     A camera that vibrates within the rows vibrates outside, too, in an unknown phase: it is assumed
-    to rotate on at one of the rates that it had. Times that a gyroscope has measured add nothing.
+    to rotate on at one of the rates that it had.
     """
     beyond = abs(tau - within_rows(tau))
     if beyond == 0.0:
         return 0.0, 0.0
     rates = shake_at(_ROWS, estimate.shake)[:, 3:]
     variance = float(np.mean(rates**2))
-    turn, rate = variance * beyond**2, variance
-    if estimate.turn is not None:
-        first, last = float(estimate.turn.tau[0]), float(estimate.turn.tau[-1])
-        unknown = abs(tau - min(max(tau, first), last))
-        if unknown > 0.0:
-            rates_of_turn = estimate.turn.at_rows(_ROWS)[1]
-            # The rate goes on as it changes: mean squared distance from its mean.
-            variance = float(np.mean((rates_of_turn - rates_of_turn.mean(axis=0)) ** 2))
-            variance *= 3.0 * (1.0 + 2.0 * beyond) ** 2
-            turn, rate = turn + variance * unknown**2, rate + variance
-    return turn, rate
+    return variance * beyond**2, variance
+
+
+def roughness(estimate: Estimate) -> float:
+    """Return the root mean square (rad per readout) of a vibration's rate beside a parabola."""
+    rates = shake_at(_ROWS, estimate.shake)[:, 3:]
+    return math.sqrt(float(np.mean((rates - _PARABOLAS @ rates) ** 2)))
 
 
 @dataclass(frozen=True, slots=True)

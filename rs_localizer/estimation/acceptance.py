@@ -29,6 +29,7 @@ from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import CalibrationEffect, promised
 from rs_localizer.estimation.gaussian import along_arcs
 from rs_localizer.estimation.hypotheses import Posterior
+from rs_localizer.estimation.known_rotation import with_turn
 from rs_localizer.estimation.points import Observed
 
 # Errors as large as the gate lets them be are those of points strewn over it.
@@ -115,7 +116,8 @@ def noise_fills(posterior: Posterior, rolling: bool) -> bool:
 
 def speeding(observed: Observed, state: Array) -> float:
     """Return the squared velocities, in standard deviations that the configuration expects."""
-    part = VELOCITIES if observed.sighted.turn is None else LINEAR  # of the rest a gyroscope knows
+    # Of the others a rotation prior knows.
+    part = VELOCITIES if observed.sighted.rotation is None else LINEAR
     velocities = state[POSE_SIZE - POSE.stop :][part]
     return float(velocities @ observed.terms.informations[0][part, part] @ velocities)
 
@@ -191,7 +193,7 @@ def estimate_of(
         effect: of what map and calibration are off.
         predicted: frames before tell how the camera moves.
     """
-    state, turn = posterior.state, observed.sighted.turn
+    state, known = posterior.state, observed.sighted.rotation
     rotation = rotation_of(state)
     indices, count = observed.sighted.usable.indices, len(observed.sighted.points)
     residuals, inliers = np.full(count, np.nan), np.zeros(count, dtype=np.bool_)
@@ -205,8 +207,11 @@ def estimate_of(
         alone = np.zeros((1, PARAMETERS)), motion[None]
         arched = along_arcs(motion, state[STATE_TRANSLATION], np.ones(1), *alone)
     beside = posterior.inflation * arched - motion
-    if turn is not None:
-        rate, change = rate + turn.rate, change + turn.change
+    shake = posterior.shake
+    if known is not None:
+        rate, change, shake = known.joined(rate, change, shake)
+        if len(covariance) == PARAMETERS:
+            covariance = with_turn(covariance, known)
     return Estimate(
         rotation=rotation,
         translation=state[STATE_TRANSLATION] - rotation @ observed.centre,
@@ -218,12 +223,12 @@ def estimate_of(
         residuals=residuals,
         joint_covariance=covariance,
         undetected_covariance=posterior.undetected + beside[:MOTION_PARAMETERS, :MOTION_PARAMETERS],
-        shake=posterior.shake,
+        shake=shake,
         vibrations=posterior.vibrations,
         model_error=posterior.model_error,
         declared_error=promised(posterior),
         iterations=samples,
-        turn=turn,
+        aided=known is not None,
         span=observed.sighted.exposure.span,
         calibration_covariance=effect.covariance,
         still_deviation=effect.still_deviation,

@@ -113,8 +113,8 @@ def calibration_effect(
         observations.packed, len(tau), posterior.state, shake_at(tau, posterior.shake)
     )
     by_motion, image, tau = lines.by_motion[chosen], lines.image[chosen], tau[chosen]
-    turn = observed.sighted.turn
-    rays = image if turn is None else rays_of_lens(turn, tau, image)
+    rotation = observed.sighted.rotation
+    rays = image if rotation is None else rays_of_lens(rotation, tau, image)
     if len(exposure.sides) == 1:
         (side,) = exposure.sides
         columns = _columns(side.camera, side.towards(rays), deviation)
@@ -153,7 +153,8 @@ def calibration_effect(
         if part < _NO_PART:
             continue
         prior, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
-        add_prior(terms_at(terms, speed, turn is not None), posterior.state, variance, prior, slope)
+        of_speed = terms_at(terms, speed, rotation is not None)
+        add_prior(of_speed, posterior.state, variance, prior, slope)
         information = products.copy()
         information[:PARAMETERS, :PARAMETERS] += prior
         inverse = inverted(information)

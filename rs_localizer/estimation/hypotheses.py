@@ -23,8 +23,10 @@ from rs_localizer.core.state import (
     POSE,
     POSE_SIZE,
     VELOCITIES,
+    step_between,
 )
 from rs_localizer.estimation.gaussian import Gaussians, mixture, weights_of
+from rs_localizer.estimation.known_rotation import coupled, uncoupled
 from rs_localizer.estimation.leans import Frame, Mode, linear_at, mode_of, over_leans
 from rs_localizer.estimation.linear_fit import (
     MIDDLE,
@@ -225,7 +227,11 @@ def _of_points(
         return best._replace(smallest_eigenvalue=0.0)
     steady = _steady(given, modes)
     groups = [steady]
-    if assumed.rolling and not (declares and planar):
+    if assumed.rolling and assumed.in_frame is not None:
+        turning = _vibrating(given, hypotheses, steady.posterior, assumed.in_frame.rest)
+        if turning is not None:  # it knows no leans
+            groups = [steady, turning] if planar else [turning]
+    elif assumed.rolling and not (declares and planar):
         # Apparent vibration before a bent board is more of its bend.
         groups = _with_turn(given, hypotheses, steady)
     return _mixed(given, groups)
@@ -422,6 +428,9 @@ def _vibrating(
     best, threshold = given.best, given.threshold
     widest = WIDEST_GATE * threshold
     gate, noise = min(max(threshold, GATE * best.noise), widest), best.noise
+    in_frame, short = given.assumed.in_frame, _SHORT
+    if in_frame is not None:  # near a rotation that is known the frame is more linear
+        short = 1.0
     now, is_last, farthest = _at(given, best.state, np.zeros(TURNS), gate), False, math.inf
     # Points decide all of the motion.
     decided = float(PARAMETERS)
@@ -429,11 +438,16 @@ def _vibrating(
         if np.count_nonzero(now.inliers) < _FEWEST_TURNING:
             return None
         beside = _beside_turn(given, now)
-        known = known_at(given.terms, beside.state)
+        known, linear = known_at(given.terms, beside.state), beside.linear
+        if in_frame is not None:
+            offset = step_between(given.terms.references[-1].copy(), beside.state)
+            linear = uncoupled(linear, in_frame.by_motion, offset)
         found = fit(
-            beside.linear, beside.shared, known, Noise(noise, 1.0, decided), prior,
+            linear, beside.shared, known, Noise(noise, 1.0, decided), prior,
             is_last or k == _STEPS - 1,
         )  # fmt: skip
+        if in_frame is not None:
+            found = coupled(found, in_frame.by_motion, offset)
         step = beside.step + found.step
         if not found.evidence > -math.inf:
             return None
@@ -444,7 +458,7 @@ def _vibrating(
             break
         noise = max(found.noise, LEAST_NOISE)
         gate = min(max(threshold, GATE * noise), widest)
-        now, is_last = _at(given, state, turn, gate), farthest < _SHORT
+        now, is_last = _at(given, state, turn, gate), farthest < short
     kept, had = np.count_nonzero(now.inliers), np.count_nonzero(best.inliers)
     if not (farthest < 1.0 and kept >= _KEPT * had):
         return None
@@ -539,7 +553,7 @@ def _in_functions(covariance: Array) -> Array:
 def _clearly_moving(given: _Given) -> bool:
     """Return True if neither rest nor another typical speed would change anything."""
     turn_known = given.assumed.turn is not None
-    first = LINEAR.start if turn_known else VELOCITIES.start  # of the others a gyroscope knows
+    first = LINEAR.start if turn_known else VELOCITIES.start  # the others are known
     place = slice(first, VELOCITIES.stop)
     spread = given.best.covariance[place, place].copy()
     part = float(np.diagonal(given.terms.informations[0])[place] @ np.diagonal(spread))

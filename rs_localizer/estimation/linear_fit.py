@@ -23,11 +23,7 @@ integrated; at each size the noise is the one that the errors leave (restricted 
 Patterson, Thompson 1971).
 
 The prior of ``k`` is an argument (:class:`TurnPrior`): for a vibration that nothing else measures
-it is :data:`VIBRATION`. A gyroscope that measures ``k ~ N(m, P)`` gives a prior with the
-information ``P^-1``. Its mean comes by :func:`moved`: products that are moved to ``k = m`` have ``k
-- m`` as unknowns. The gyroscope's angular velocity and acceleration are a part of the motion's
-prior. Their coupling with ``k`` stands in ``KnownMotion.information`` and ``slope``, which may be
-of all 72 unknowns.
+it is :data:`VIBRATION`. Where readings tell the rotation, :mod:`.known_rotation` makes one of them.
 """
 
 from __future__ import annotations
@@ -57,9 +53,12 @@ from rs_localizer.estimation.robust import LEAST_NOISE, TINY, half_inverse, squa
 from rs_localizer.estimation.smooth_error import ORDINARY, Shared
 from rs_localizer.native import entry, kernel
 
-TURNS = 3 * RESOLVED
+TURNS: int = 3 * RESOLVED
 """Unknowns of the in-frame turn."""
-BLOCKS = {"motion": slice(0, PARAMETERS), "turn": slice(PARAMETERS, PARAMETERS + TURNS)}
+BLOCKS: dict[str, slice] = {
+    "motion": slice(0, PARAMETERS),
+    "turn": slice(PARAMETERS, PARAMETERS + TURNS),
+}
 """Places of the unknowns, by name."""
 SHARED = "shared"
 """The name of the errors that points share, which are noise and no unknowns."""
@@ -122,7 +121,7 @@ def _vibration() -> TurnPrior:
 
 
 VIBRATION = _vibration()
-"""Prior of the in-frame turn of a camera without a gyroscope."""
+"""Prior of the in-frame turn that nothing but the points measures."""
 NO_TURN = TurnPrior(np.zeros((0, TURNS, TURNS)), np.zeros(0), FACTORS, np.zeros((0, len(FACTORS))))
 """Prior for products that have no columns of an in-frame turn."""
 

@@ -25,9 +25,9 @@ from rs_localizer.core.arrays import (
     Random,
 )
 from rs_localizer.core.blocks import median
-from rs_localizer.core.gyro_rotation import GyroRotation, gyro_compensated
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Mounts, Rig
+from rs_localizer.core.rotation_prior import RotationPrior, compensated
 from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.types import Failure
 from rs_localizer.estimation.prior import Assumed, PriorTerms
@@ -268,7 +268,7 @@ def relinearized(
     exposure: Exposure,
     observations: Observations,
     state: Array,
-    turn: GyroRotation | None,
+    rotation: RotationPrior | None,
     fewest: int = _MANY,
 ) -> Observations:
     """Return observations with derivatives at a motion near the best; few points stay.
@@ -281,37 +281,37 @@ def relinearized(
 
     Args:
         state: (24,) of the motion.
-        turn: the known rotation that was taken out of the observations.
+        rotation: the known one that was taken out of the observations.
         fewest: number of points from which on they are linearized anew.
     """
     count = observations.count
-    if count < fewest or (turn is None and all(len(each.D) == 0 for each in exposure.cameras)):
+    if count < fewest or (rotation is None and all(len(each.D) == 0 for each in exposure.cameras)):
         return observations
     lines = linearized(observations.packed, count, state, np.zeros((count, 6)))
     near = np.abs(lines.errors).max(axis=1) < _NEAR  # NaN compares false
     rays = np.where(near[:, None], lines.image, observations.rays)
-    if turn is None:
+    if rotation is None:
         by_ray = np.empty((count, 2, 2))
         for place, side in enumerate(exposure.sides):
             here = observations.camera == place
             by_ray[here] = side.pixel_jacobian(rays[here])
     else:
         (camera,), gradient = exposure.cameras, observations.mounts.gradients[0]
-        raw = rays_of_lens(turn, observations.tau, rays)
-        by_ray = gyro_compensated(
-            raw, observations.tau, camera.pixel_jacobian(raw), gradient, turn
-        )[1]
+        raw = rays_of_lens(rotation, observations.tau, rays)
+        by_ray = compensated(raw, observations.tau, camera.pixel_jacobian(raw), gradient, rotation)[
+            1
+        ]
     return Observations.of(
         observations.points, observations.rays, observations.tau, by_ray, observations.mounts,
         observations.camera,
     )  # fmt: skip
 
 
-def rays_of_lens(turn: GyroRotation | None, tau: Array, rays: Array) -> Array:
+def rays_of_lens(rotation: RotationPrior | None, tau: Array, rays: Array) -> Array:
     """Return rays (n,2) at row times (n,) with the known rotation that was taken out."""
-    if turn is None:
+    if rotation is None:
         return rays
-    turned = turn.at_rows(tau)[0]
+    turned = rotation.at_rows(tau)[0]
     local = np.einsum("nij,nj->ni", turned, np.column_stack([rays, np.ones(len(rays))]))
     seen: Array = local[:, :2] / local[:, 2:]
     return seen
@@ -342,7 +342,7 @@ class Sighted:
     points: Array  # (n,3)
     pixels: Array  # (n,2)
     usable: Usable
-    turn: GyroRotation | None  # what the rays are compensated by
+    rotation: RotationPrior | None  # what the rays are compensated by
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -368,17 +368,17 @@ def find_usable(
     points: Array,
     pixels: Array,
     counts: Sequence[int],
-    turn: GyroRotation | None,
+    rotation: RotationPrior | None,
 ) -> Usable:
     """Find the usable ones of points (n,3) and pixels (n,2), so many of each camera in turn.
 
-    A known turn is taken out of them.
+    A known rotation is taken out of them.
     """
     parts, first = [], 0
     for place, count in enumerate(counts):
         own = pixels[first : first + count]
         tau = exposure.row_time(place, own)
-        parts.append((*_rays(exposure, place, own, tau, turn), tau))
+        parts.append((*_rays(exposure, place, own, tau, rotation), tau))
         first += count
     rays, by_ray, side, tau = (
         parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts, strict=True))
@@ -394,13 +394,13 @@ def find_usable(
 
 
 def _rays(
-    exposure: Exposure, place: int, pixels: Array, tau: Array, turn: GyroRotation | None
+    exposure: Exposure, place: int, pixels: Array, tau: Array, rotation: RotationPrior | None
 ) -> tuple[Array, Array, IntArray]:
     """Return rays as of :meth:`Exposure.look`, compensated."""
     rays, by_ray, side = exposure.look(place, pixels)
-    if turn is not None:
+    if rotation is not None:
         gradient = exposure.mounts.gradients[0]  # of a camera alone
-        rays, by_ray = gyro_compensated(rays, tau, by_ray, gradient, turn)
+        rays, by_ray = compensated(rays, tau, by_ray, gradient, rotation)
     return rays, by_ray, side
 
 

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Priors of the motion before the image: Gaussians, a gyroscope's turn, gravity's direction.
+"""Priors of the motion before the image: Gaussians, a known rotation, gravity's direction.
 
 :class:`Prior` is what a user gives, :class:`PriorTerms` what kernels take, and :func:`add_prior`
 what it adds to the normal equations. :func:`assumptions` makes them of the configuration.
@@ -12,15 +12,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig, RefinementKind
 from rs_localizer.core.arrays import Array, Array1, Array2, Array3, Out
-from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.rig import Rig
+from rs_localizer.core.rotation_prior import ROTATION, RotationPrior
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.so3 import log
 from rs_localizer.core.state import (
@@ -38,6 +38,9 @@ from rs_localizer.core.state import (
 )
 from rs_localizer.native import entry, inlined
 from rs_localizer.solvers.table import Solver
+
+if TYPE_CHECKING:  # which needs this module
+    from rs_localizer.estimation.known_rotation import CoupledTurn
 
 # Rounding error of an orthonormal matrix, or of a symmetric one with a unit diagonal.
 _ROUNDING = 1e-6
@@ -104,8 +107,8 @@ class Prior:
         motion, covariance: expected motion and its (12,12) covariance, in the order of
             ``Estimate.covariance``, or (18,18) with its accelerations, in the order of
             ``Estimate.joint_covariance``; infinite variances leave a parameter free.
-        angular_velocity, angular_velocity_deviation: a gyroscope's body rate (3,) in camera axes
-            times the readout time (rad per readout), and its standard deviation.
+        angular_velocity, angular_velocity_deviation: a measured body rate (3,) in camera axes times
+            the readout time (rad per readout), and its standard deviation.
         of_rest: logarithm of the odds that the camera does not move within the image, beside
             those of any camera.
         of_vibration: (s,f) logarithms of the odds of each vibration against none by other frames,
@@ -209,8 +212,8 @@ def terms_at(terms: PriorTerms, speed: float, turn_known: bool) -> PriorTerms:
     """Return the prior of a typical speed, a part of the configured one; 0: at rest.
 
     Neither travel nor accelerations slow down as much as turns: who hardly turns may walk, and
-    jolts come at any speed. At rest, only gravity is as in the terms. What a gyroscope leaves of a
-    turn does not depend on the speed.
+    jolts come at any speed. At rest, only gravity is as in the terms. What a known
+    rotation leaves of a turn does not depend on the speed.
     """
     informations = terms.informations.copy()
     if speed == 0.0:
@@ -261,8 +264,8 @@ def with_motion(
 ) -> PriorTerms:
     """Add a prior's motion in the map frame, for points relative to ``centre`` (3,).
 
-    Its term, if it knows anything, is the last one. Beside a known turn it knows the gyroscope's
-    errors, too.
+    Its term, if it knows anything, is the last one. Beside a known rotation it knows the
+    errors of that, too.
     """
     if prior.motion is None or not knows_motion(prior):
         return terms
@@ -467,7 +470,7 @@ _UNKNOWN_READOUT_TIME = 0.03
 
 @dataclass(frozen=True, slots=True)
 class TurnSeen:
-    """Speed of a motion as a gyroscope says it."""
+    """Speed of a motion as a rotation prior says it."""
 
     squared_rate: float  # (rad per readout)^2
     variance: float  # of each axis, if the camera is at rest
@@ -489,7 +492,8 @@ class Assumed:
     rolling: bool  # velocities are estimated
     of_rest: float = 0.0  # logarithm of the odds for rest, beside those of any camera
     of_vibration: Array = field(default_factory=np.zeros((0, 0)).copy)  # see Prior
-    turn: TurnSeen | None = None  # by a gyroscope
+    turn: TurnSeen | None = None  # by a rotation prior
+    in_frame: CoupledTurn | None = None  # likewise
 
 
 def assumptions(
@@ -520,13 +524,13 @@ def assumptions(
 
 
 def of_frame(
-    terms: PriorTerms, assumed: Assumed, prior: Prior | None, turn: GyroRotation | None
+    terms: PriorTerms, assumed: Assumed, prior: Prior | None, rotation: RotationPrior | None
 ) -> tuple[PriorTerms, Assumed]:
-    """Add what is known of this frame by a gyroscope, of rest or of vibration."""
-    if turn is not None:
-        assumed = replace(assumed, turn=turn_seen(terms, turn))
+    """Add what is known of this frame: its rotation, rest, vibration, and measurements."""
+    if rotation is not None:
+        assumed = replace(assumed, turn=turn_seen(terms, rotation))
         informations = terms.informations.copy()
-        informations[0][_TURNING] = np.linalg.inv(turn.error)
+        informations[0][_TURNING] = np.linalg.inv(rotation.error)
         terms = terms._replace(informations=informations)
     if prior is not None:
         assumed = replace(assumed, of_rest=prior.of_rest, of_vibration=prior.of_vibration)
@@ -534,9 +538,20 @@ def of_frame(
     return terms, assumed
 
 
-def turn_seen(terms: PriorTerms, turn: GyroRotation) -> TurnSeen:
+def beside(prior: Prior, rotation: RotationPrior) -> Prior:
+    """Return a prediction of the whole motion as one of the motion beside a known rotation."""
+    assert prior.motion is not None
+    assert prior.covariance is not None
+    turning, covariance = ROTATION[:6], np.array(prior.covariance)
+    covariance[turning] = covariance[:, turning] = 0.0
+    covariance[np.ix_(turning, turning)] = rotation.error
+    still = replace(prior.motion, angular_velocity=np.zeros(3), angular_acceleration=np.zeros(3))
+    return replace(prior, motion=still, covariance=covariance)
+
+
+def turn_seen(terms: PriorTerms, rotation: RotationPrior) -> TurnSeen:
     """Return the speed by a known rotation, beside the configured prior."""
-    variance = sum(turn.error.diagonal()[:3].tolist()) / 3.0 + turn.rate_noise**2
+    variance, rate = sum(rotation.error.diagonal()[:3].tolist()) / 3.0, rotation.smooth_rate
     precision = float(terms.informations[0, ANGULAR.start, ANGULAR.start])
     typical = 1.0 / precision if precision > 0.0 else math.inf
-    return TurnSeen(float(turn.rate @ turn.rate), variance, typical)
+    return TurnSeen(float(rate @ rate), variance, typical)

@@ -33,7 +33,7 @@ import numpy as np
 from rs_localizer.config import Acceleration
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, Array1, Array2, Array3
-from rs_localizer.core.gyro_rotation import GyroRotation
+from rs_localizer.core.rotation_prior import RotationPrior
 from rs_localizer.core.shake import MIDDLE_RATES, MIDDLE_VALUES
 from rs_localizer.core.shutter import Motion, carried
 from rs_localizer.core.state import (
@@ -78,8 +78,7 @@ _KNOTS = np.array([1.0, 2.0, 3.0]) / 3.0
 _NEWEST, _FIRST = 0.08, 0.5
 # Largest ratio of squared errors that one image may contribute.
 _MOST_RATIO = 20.0
-# Smallest factor if the window has learnt its accelerations, and beside a gyroscope, where it has
-# not.
+# Smallest factor if the window has learnt its accelerations, and beside an aid, where it has not.
 _LEAST, _LEAST_UNLEARNT = 1.0, 0.1
 # A factor rests on some twelve independent numbers, so regions follow F(3, 12) instead of
 # chi-squared: the ratio of their 95 % bounds.
@@ -399,16 +398,16 @@ def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array, Array]:
     """Return the motion without vibration, both covariances, and the derivative of that motion.
 
     A camera that shakes is, in the middle row, somewhere on its swing; a frame later it is
-    somewhere else on it. What a gyroscope knows of the turn is not in the motion, either.
+    somewhere else on it.
     """
-    motion, shake, joint = estimate.without_gyro(), estimate.shake, estimate.joint_covariance
+    shake, joint = estimate.shake, estimate.joint_covariance
     values, rates = MIDDLE_VALUES[: len(shake)], MIDDLE_RATES[: len(shake)]
     turned = so3.exp(values @ shake)
     still = Motion(
-        turned @ motion.rotation, turned @ motion.translation,
-        motion.angular_velocity - rates @ shake, motion.linear_velocity,
-        angular_acceleration=motion.angular_acceleration,
-        linear_acceleration=motion.linear_acceleration,
+        turned @ estimate.rotation, turned @ estimate.translation,
+        estimate.angular_velocity - rates @ shake, estimate.linear_velocity,
+        angular_acceleration=estimate.angular_acceleration,
+        linear_acceleration=estimate.linear_acceleration,
     )  # fmt: skip
     squares, swing = np.square(shake).sum(axis=1) / 3.0, np.zeros((PARAMETERS, PARAMETERS))
     swing[TURN, TURN] = (values**2 @ squares) * np.eye(3)
@@ -417,18 +416,6 @@ def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array, Array]:
     covariance = jacobian @ joint @ jacobian.T
     # Pose and turn cancel: what rounding leaves of the difference of two large variances.
     return still, 0.5 * (covariance + covariance.T), swing, jacobian
-
-
-def mean_turn(turn: GyroRotation) -> tuple[Array, Array]:
-    """Return the mean rate (3,) of a known turn and a covariance (18,18), to go on without it.
-
-    How much the rate changed within the readout, a gyroscope knows it to change in the next.
-    """
-    ends, rates = turn.at_rows(np.array([-0.5, 0.5]))
-    mean = so3.log(np.ascontiguousarray(ends[0] @ ends[1].T))
-    spread = np.zeros((PARAMETERS, PARAMETERS))
-    spread[ANGULAR, ANGULAR] = np.mean((rates - mean) ** 2) * np.eye(3)
-    return mean, spread
 
 
 def _per_second(span: float) -> Array:
@@ -444,12 +431,8 @@ def _state(motion: Motion, units: Array) -> Array:
 
 
 def gaussian_of(estimate: Estimate, time_ns: int) -> Gaussian:
-    """Return the motion of one frame without vibration and without a gyroscope's rotation."""
+    """Return the motion of one frame without vibration."""
     motion, covariance, _, _ = unshaken(estimate)
-    if estimate.turn is not None:
-        mean, spread = mean_turn(estimate.turn)
-        motion = replace(motion, angular_velocity=motion.angular_velocity + mean)
-        covariance = covariance + spread
     units = _per_second(estimate.span)
     return Gaussian(time_ns, _state(motion, units), covariance * np.outer(units, units))
 
@@ -468,7 +451,7 @@ def motion_of(gaussian: Gaussian, span: float) -> tuple[Motion, Array]:
 
 
 def told_of(estimate: Estimate, known: PriorTerms) -> MotionSample:
-    """Return what the points of an estimate tell of its motion, per readout, beside its turn.
+    """Return what the points of an estimate tell of its motion, per readout.
 
     ``known`` is what was known of that motion before, in the map's frame.
     """
@@ -479,21 +462,20 @@ def told_of(estimate: Estimate, known: PriorTerms) -> MotionSample:
     return MotionSample(estimate.time_ns, state, _told_by_points(covariance, information), slope)
 
 
-def sample_of(estimate: Estimate, time_ns: int, known: PriorTerms) -> MotionSample:
+def sample_of(
+    estimate: Estimate, time_ns: int, known: PriorTerms, rotation: RotationPrior | None = None
+) -> MotionSample:
     """Sample by the points of an estimate, beside what was known of its motion before.
 
     Args:
-        known: that, in the map's frame; of an estimate with a gyroscope beside the known turn.
+        known: that, in the map's frame.
+        rotation: beside which it is; None: it is the whole motion.
     """
-    told = told_of(estimate, known)
+    told = told_of(estimate if rotation is None else rotation.beside(estimate), known)
     state, information, slope = told.state.copy(), told.information, told.gradient
-    if estimate.turn is not None:
-        mean, spread = mean_turn(estimate.turn)
-        state[STATE_ANGULAR] += mean
-        # (L^-1 + spread)^-1 of what is not known for sure.
-        left = np.linalg.inv(np.eye(PARAMETERS) + information @ spread)
-        information, slope = left @ information, left @ slope
-        information = 0.5 * (information + information.T)
+    if rotation is not None:
+        state[STATE_ANGULAR] += rotation.smooth_rate
+        state[STATE_ANGULAR_ACCELERATION] += rotation.change
     units = _per_second(estimate.span)
     state[12:] *= units[6:]
     return MotionSample(time_ns, state, information / np.outer(units, units), slope / units)
@@ -535,7 +517,6 @@ def predicted_estimate(nearest: Estimate, gaussian: Gaussian, swing: Array) -> E
         covariance + swing,
         **{each.name: getattr(motion, each.name) for each in fields(Motion)},
         shake=np.zeros((0, 3)),
-        turn=None,
         time_ns=gaussian.time_ns,
     )
 
@@ -594,7 +575,7 @@ class PredictionErrors:
         """
         if self._longest <= 0.0:
             return
-        self._least = _LEAST if found.turn is None else _LEAST_UNLEARNT
+        self._least = _LEAST if not found.aided else _LEAST_UNLEARNT
         apart, kept = math.inf, []  # s since the newest of the past
         for past in self._past:
             seconds = 1e-9 * (found.time_ns - past[0])

@@ -19,15 +19,16 @@ from __future__ import annotations
 import math
 from collections import deque
 from copy import copy
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.gyro_rotation import GyroRotation, late_at
 from rs_localizer.core.reasons import ImuReason
-from rs_localizer.core.shake import FUNCTIONS, shake_basis
+from rs_localizer.core.rotation_prior import ROTATION, WHOLE, RotationPrior
+from rs_localizer.core.shake import COMBINATIONS, shake_functions
 from rs_localizer.core.shutter import Motion, carried, motion_of, numbers_of
 from rs_localizer.core.state import (
     ANGULAR,
@@ -38,6 +39,8 @@ from rs_localizer.core.state import (
     step_between,
 )
 from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.known_rotation import LastFrame, turn_of, whole_covariance
+from rs_localizer.estimation.linear_fit import BLOCKS, MIDDLE, TURNS
 from rs_localizer.estimation.prior import Prior, state_in
 from rs_localizer.estimation.window import MotionSample
 from rs_localizer.inertial.gravity import gravity_seen
@@ -46,17 +49,18 @@ from rs_localizer.inertial.status import InertialSettings, InertialStatus, Unuse
 from rs_localizer.inertial.turning import (
     BETWEEN,
     BIAS,
-    CHANGE,
     DELAY,
     MOUNT,
-    RATE,
     SCALE,
+    WITHIN,
     GyroscopeErrors,
-    Rotated,
-    rotated,
+    Read,
+    read,
 )
 from rs_localizer.inertial.turning import PARAMETERS as ERRORS
 
+# Deviation (s) of a gyroscope's delay that no frames estimate: it is the given one.
+_GIVEN_DELAY = 1e-4
 # Biases of gyroscopes that were never calibrated, rad/s, of each axis.
 _BIAS_DEVIATION = math.radians(3.0)
 # Clocks drift apart, s/sqrt(s).
@@ -67,7 +71,7 @@ _SEEN = np.r_[TURN, ANGULAR]
 _MOST_DISTANCE = 22.46
 # Least share of a prediction's covariance by which points know a motion better, so that it is no
 # rounding.
-_LEAST_GAIN = 1e-6
+_LEAST_GAIN = 0.03
 # If so many of the last frames contradict a gyroscope, that is no chance, and it has changed: what
 # it is off by is learned anew.
 _WATCHED, _CONTRADICTIONS = 12, 4
@@ -79,55 +83,42 @@ _HARDLY = 0.25
 # Row times at which a turn beside the gyroscope's is compared with none, and the 99.9 % quantile of
 # chi-squared of its twelve numbers: a half cycle per readout and more.
 _ROWS, _MOST_SWING = (-0.375, -0.125, 0.125, 0.375), 32.91
-# The squares of a wave are at most twice their mean.
-_PEAK = 2.0
+# Size of vibration, over an ordinary one, that does not matter.
+_LEAST_SWING = 0.3
 # s: over which rates have changed as they will.
 _LATELY = 0.1
 _TURNING = np.r_[ANGULAR, ANGULAR_ACCELERATION]
+# The middle row's turn by an in-frame turn; its rate is that without the in-frame turn's.
+MIDDLE_POSE = np.zeros_like(MIDDLE)
+MIDDLE_POSE[TURN] = MIDDLE[TURN]
 # Variances of a pose that nothing predicts, rad^2 and m^2.
 _ANYWHERE = 1e4
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Before:
-    """The last frame with a pose, for a prediction."""
-
-    middle_ns: int
-    motion: Motion  # beside its known turn
-    covariance: Array  # (18,18)
-    added: Array  # (18,18) that the prediction gets, but for the rotation
-    fading: float  # of accelerations, in readouts
-
-
 class _Foreseen(NamedTuple):
-    """A motion beside the known turn before its points, with the gyroscope's numbers."""
+    """A motion beside the known rotation before its points, with the gyroscope's numbers."""
 
     motion: Motion
-    covariance: Array  # (18,18)
-    tied: Array  # (18,10) covariance with the numbers
+    covariance: Array  # (72,72), or of the motion alone (18,18)
+    tied: Array  # (72,10), or (18,10), covariance with the numbers
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class GyroPrediction:
+class GyroPrediction(NamedTuple):
     """The gyroscope's knowledge of a frame."""
 
-    rotation: Rotated
-    prior: Prior | None  # of the motion beside the turn; None: nothing follows from before
+    readings: Read
+    rotation: RotationPrior
+    prior: Prior | None  # of the motion beside the rotation; None: nothing follows from before
     foreseen: _Foreseen | None
-
-    @property
-    def turn(self) -> GyroRotation:
-        return self.rotation.known
 
     def of(self, last: Estimate) -> Estimate:
         """Return the estimate that it makes of the last frame's."""
         assert self.foreseen is not None
-        motion, turn = self.foreseen.motion, self.turn
+        motion, known = self.foreseen.motion, self.rotation
         numbers = {each.name: getattr(motion, each.name) for each in fields(Motion)}
-        numbers["angular_velocity"] = motion.angular_velocity + turn.rate
-        numbers["angular_acceleration"] = motion.angular_acceleration + turn.change
+        numbers["angular_velocity"], numbers["angular_acceleration"] = known.rate, known.change
         return last.with_joint_covariance(
-            self.foreseen.covariance, **numbers, shake=np.zeros((0, 3)), turn=turn
+            whole_covariance(self.foreseen.covariance), **numbers, shake=known.shake
         )
 
 
@@ -141,6 +132,15 @@ class GyroscopeTrack:
 
     def __init__(self, settings: InertialSettings, readout_time: float) -> None:
         self._settings, self._readout_time = settings, readout_time
+        self._prepare()
+
+    def forget_delay(self) -> None:
+        """Take the given delay for the right one: no frames will tell."""
+        self._settings = replace(self._settings, time_offset_deviation=_GIVEN_DELAY)
+        self._prepare()
+
+    def _prepare(self) -> None:
+        settings = self._settings
         deviations = np.repeat(
             [
                 _BIAS_DEVIATION, settings.time_offset_deviation, settings.scale_deviation,
@@ -192,7 +192,7 @@ class GyroscopeTrack:
         return int(samples.times_ns[-1]) + round(1e9 * self.errors.time_offset) - 1
 
     def foresee(
-        self, samples: ImuSamples | None, middle_ns: int, last: Before | None
+        self, samples: ImuSamples | None, middle_ns: int, last: LastFrame | None
     ) -> GyroPrediction | None:
         """Return what it says of a frame before its points; None: samples do not cover the frame.
 
@@ -215,7 +215,7 @@ class GyroscopeTrack:
         found = self.ahead(samples, middle_ns, None) or self._strayed(samples, middle_ns)
         if found is None:
             return None
-        return replace(found, prior=self._gravity(samples, middle_ns))
+        return found._replace(prior=self._gravity(samples, middle_ns))
 
     def _strayed(self, samples: ImuSamples, middle_ns: int) -> GyroPrediction | None:
         """Begin anew, if a delay that is hardly known leads away from the samples."""
@@ -230,21 +230,24 @@ class GyroscopeTrack:
         self._tied = np.zeros((PARAMETERS, ERRORS))
 
     def ahead(
-        self, samples: ImuSamples, middle_ns: int, last: Before | None
+        self, samples: ImuSamples, middle_ns: int, last: LastFrame | None
     ) -> GyroPrediction | None:
         """Return the prediction of a moment after the last frame, as if it were a frame's.
 
         It is None if samples do not cover it.
         """
         since = None if last is None else last.middle_ns
-        turned = rotated(samples, middle_ns, self._readout_time, self.errors, since)
-        if turned is None:
+        found = read(samples, middle_ns, self._readout_time, self.errors, since)
+        if found is None:
             return None
         if last is None:
-            return GyroPrediction(turned, None, None)
-        foreseen = self._carried(turned, last, 1e-9 * (middle_ns - last.middle_ns))
-        prior = Prior(motion=foreseen.motion, covariance=foreseen.covariance)
-        return GyroPrediction(turned, prior, foreseen)
+            return GyroPrediction(found, rotation_by(found, self.errors), None, None)
+        foreseen = self._carried(found, last, 1e-9 * (middle_ns - last.middle_ns))
+        rotation = RotationPrior(*found[:3], foreseen.covariance, predicted=True)
+        prior = Prior(
+            motion=foreseen.motion, covariance=foreseen.covariance[:PARAMETERS, :PARAMETERS]
+        )
+        return GyroPrediction(found, rotation, prior, foreseen)
 
     def _gravity(self, samples: ImuSamples, middle_ns: int) -> Prior | None:
         up = self._settings.gravity_in_map
@@ -253,36 +256,45 @@ class GyroscopeTrack:
             return None
         return Prior(gravity=seen[0], gravity_deviation=seen[1], gravity_in_map=up)
 
-    def _carried(self, turned: Rotated, last: Before, seconds: float) -> _Foreseen:
+    def _carried(self, found: Read, last: LastFrame, seconds: float) -> _Foreseen:
         """Return the motion after a turn, beside the rotation within this frame."""
-        assert turned.between is not None
+        assert found.between is not None
         still = replace(last.motion, angular_velocity=np.zeros(3), angular_acceleration=np.zeros(3))
         later, transport = carried(numbers_of(still), seconds / self._readout_time, last.fading)
         transport[:, _TURNING] = 0.0  # the camera turns as the gyroscope says
         for k in range(0, PARAMETERS, 3):
-            transport[k : k + 3] = turned.between @ transport[k : k + 3]
+            transport[k : k + 3] = found.between @ transport[k : k + 3]
         names = ("rotation", "translation", "linear_velocity", "linear_acceleration")
         moved = motion_of(later)
         motion = replace(moved, **{
-            name: np.ascontiguousarray(turned.between @ getattr(moved, name)) for name in names
+            name: np.ascontiguousarray(found.between @ getattr(moved, name)) for name in names
         })  # fmt: skip
-        by_errors = np.zeros((PARAMETERS, ERRORS))
-        by_errors[TURN] = turned.by_errors[BETWEEN]
-        by_errors[ANGULAR], by_errors[ANGULAR_ACCELERATION] = (
-            turned.by_errors[RATE], turned.by_errors[CHANGE],
-        )  # fmt: skip
-        by_errors[LINEAR] = np.cross(motion.linear_velocity, turned.by_errors[BETWEEN].T).T
-        known, tied = self.errors.covariance, self._tied
+        # Of all numbers by those that the gyroscope tells.
+        by_told = np.zeros((WHOLE, len(found.by_errors)))
+        by_told[TURN, BETWEEN], by_told[ROTATION, WITHIN] = np.eye(3), np.eye(len(ROTATION))
+        by_told[LINEAR, BETWEEN] = so3.hat(motion.linear_velocity)
+        by_told[:PARAMETERS] -= MIDDLE_POSE @ by_told[PARAMETERS:]
+        by_errors = by_told @ found.by_errors
+        known, tied, motions = self.errors.covariance, self._tied, slice(0, PARAMETERS)
         if not _is_positive(np.block([[last.covariance, tied], [tied.T, known]])):
             tied = np.zeros_like(tied)
-        crossed = transport @ tied @ by_errors.T
-        covariance = transport @ last.covariance @ transport.T + crossed + crossed.T
-        covariance += by_errors @ known @ by_errors.T + last.added
-        places = np.r_[TURN, _TURNING]
-        covariance[places, places] += turned.variances
-        return _Foreseen(
-            motion, 0.5 * (covariance + covariance.T), transport @ tied + by_errors @ known
-        )
+        tied = np.concatenate([transport @ tied, np.zeros((WHOLE - PARAMETERS, ERRORS))])
+        crossed = tied @ by_errors.T
+        covariance = crossed + crossed.T + by_errors @ known @ by_errors.T
+        covariance += by_told @ found.rest @ by_told.T
+        covariance[motions, motions] += transport @ last.covariance @ transport.T + last.added
+        return _Foreseen(motion, 0.5 * (covariance + covariance.T), tied + by_errors @ known)
+
+    def changed(self, samples: ImuSamples, seconds: float) -> float:
+        """Return the mean squared change of an axis' rates (rad/s)^2 in so many s, of late."""
+        times = 1e-9 * (samples.times_ns - samples.times_ns[-1])
+        late = times >= times[0] + seconds
+        late &= times >= -_LATELY
+        if not late.any():
+            return math.inf
+        rates = samples.angular_velocity
+        before = [np.interp(times[late] - seconds, times, rates[:, axis]) for axis in range(3)]
+        return float(np.mean((rates[late] - np.transpose(before)) ** 2))
 
     def agrees(self, prediction: GyroPrediction, found: Estimate, told: MotionSample) -> bool:
         """Learn from a frame, and return whether the camera's own rotation is the gyroscope's.
@@ -291,8 +303,9 @@ class GyroscopeTrack:
             found: the frame, with the gyroscope or without.
             told: what points tell of the motion beside the known turn, per readout.
         """
-        foreseen = prediction.foreseen or self._of_turn(prediction.rotation, told)
-        spread, information = foreseen.covariance, told.information
+        foreseen = prediction.foreseen or self._of_rotation(prediction, told)
+        motions = slice(0, PARAMETERS)
+        spread, information = foreseen.covariance[motions, motions].copy(), told.information
         start = state_in(foreseen.motion, np.zeros(3))
         pull = told.gradient + information @ step_between(start, told.state)
         gain = np.linalg.inv(np.eye(PARAMETERS) + spread @ information)
@@ -300,9 +313,11 @@ class GyroscopeTrack:
         seen = np.ix_(_SEEN, _SEEN)
         expected = gained[seen] + _LEAST_GAIN * spread[seen]
         far = float(step[_SEEN] @ np.linalg.solve(expected, step[_SEEN])) / _MOST_DISTANCE
-        far = max(far, _swung(found, prediction.rotation) / _MOST_SWING)
+        if found.aided:
+            far = max(far, _swung(found, prediction.rotation) / _MOST_SWING)
         # A prediction that is too far off counts as much as one at the limit.
-        self._learn(foreseen, information / max(far, 1.0), pull / max(far, 1.0))
+        part = _Foreseen(foreseen.motion, spread, foreseen.tied[motions])
+        self._learn(part, information / max(far, 1.0), pull / max(far, 1.0))
         agrees = bool(far <= 1.0)
         self._contradictions.append(not agrees)
         self._age += 1
@@ -326,17 +341,18 @@ class GyroscopeTrack:
         self.errors = replace(self.errors, mean=mean, covariance=covariance)
         self._tied = gain @ tied
 
-    def _of_turn(self, turned: Rotated, told: MotionSample) -> _Foreseen:
+    def _of_rotation(self, prediction: GyroPrediction, told: MotionSample) -> _Foreseen:
         """Return what it says of a frame that follows no other, near what its points tell."""
         state = told.state
         motion = Motion(
             state[:9].reshape(3, 3), state[9:12], np.zeros(3), state[15:18],
             linear_acceleration=state[21:24],
         )  # fmt: skip
-        covariance = np.diag(np.full(PARAMETERS, _ANYWHERE))
-        covariance[np.ix_(_TURNING, _TURNING)] = turned.known.error
-        tied = np.zeros((PARAMETERS, ERRORS))
-        tied[_TURNING] = turned.by_errors[BETWEEN.stop :] @ self.errors.covariance
+        covariance = prediction.rotation.covariance.copy()
+        others = np.setdiff1d(np.arange(PARAMETERS), ROTATION)
+        covariance[others, others] = _ANYWHERE
+        tied = np.zeros((WHOLE, ERRORS))
+        tied[ROTATION] = prediction.readings.by_errors[WITHIN] @ self.errors.covariance
         return _Foreseen(motion, covariance, tied)
 
     def _oddity(self) -> str:
@@ -356,6 +372,14 @@ class GyroscopeTrack:
         return bool(certain and np.mean(off**2) > self._before_all[place.start, place.start])
 
 
+def rotation_by(found: Read, errors: GyroscopeErrors) -> RotationPrior:
+    """Return what readings tell of the rotation within a frame, if nothing predicts its motion."""
+    within, covariance = found.by_errors[WITHIN], np.zeros((WHOLE, WHOLE))
+    known = within @ errors.covariance @ within.T + found.rest[WITHIN, WITHIN]
+    covariance[np.ix_(ROTATION, ROTATION)] = known
+    return RotationPrior(*found[:3], covariance, predicted=False)
+
+
 def _scale(off: Array) -> str:
     share = float(off[np.abs(off).argmax()])
     return f"it turns {100.0 * abs(share):.0f} % too {'fast' if share > 0.0 else 'slowly'}"
@@ -372,21 +396,24 @@ def _delay(off: Array) -> str:
 _WORDS = ((SCALE, _scale), (MOUNT, _mount), (DELAY, _delay))
 
 
-def _swung(found: Estimate, turned: Rotated) -> float:
+def _swung(found: Estimate, rotation: RotationPrior) -> float:
     """Return the squared size, in deviations, of a vibration that points see beside it."""
-    if found.turn is None or not len(found.shake):
-        return 0.0
-    values, known = np.zeros((len(_ROWS), FUNCTIONS)), turned.known
-    covariance = np.diag(np.tile(_PEAK * turned.swing, len(_ROWS)))
-    late = np.zeros((len(_ROWS), 3))
-    for k, tau in enumerate(_ROWS):
-        shake_basis(tau, values[k], np.zeros(FUNCTIONS))
-        late[k] = known.delay * late_at(tau, known.tau, known.rates, known.parabola)[0]
-    seen = (values @ found.shake).ravel()
-    by_shake = np.kron(values, np.eye(3))
-    covariance += by_shake @ found.joint_covariance[PARAMETERS:, PARAMETERS:] @ by_shake.T
-    covariance += np.outer(late, late)
+    turn = turn_of(rotation.beside(found))
+    place = BLOCKS["turn"]
+    known = rotation.covariance[place, place] + _LEAST_SWING**2 * np.eye(TURNS)
+    covariance = _SWINGS @ known @ _SWINGS.T
+    seen = _SWINGS @ turn
     return float(seen @ np.linalg.solve(covariance, seen))
+
+
+def _swings() -> Array:
+    """Return derivatives (12,54) of turns at the row times by an in-frame turn."""
+    values = shake_functions(np.array(_ROWS))[0] @ COMBINATIONS
+    swings: Array = np.asarray(np.kron(values, np.eye(3)), np.float64)
+    return swings
+
+
+_SWINGS = _swings()
 
 
 def _is_positive(joint: Array) -> bool:
@@ -396,29 +423,3 @@ def _is_positive(joint: Array) -> bool:
     except np.linalg.LinAlgError:
         return False
     return True
-
-
-def changed(samples: ImuSamples, seconds: float) -> float:
-    """Return the mean squared change of the rates of an axis (rad/s)^2 in so many s, of late."""
-    times = 1e-9 * (samples.times_ns - samples.times_ns[-1])
-    late = times >= times[0] + seconds
-    late &= times >= -_LATELY
-    if not late.any():
-        return math.inf
-    rates = samples.angular_velocity
-    before = [np.interp(times[late] - seconds, times, rates[:, axis]) for axis in range(3)]
-    return float(np.mean((rates[late] - np.transpose(before)) ** 2))
-
-
-def without_gyro(prior: Prior | None, turn: GyroRotation) -> Prior | None:
-    """Return the prediction of the camera alone, for a motion beside a known turn."""
-    if prior is None:
-        return None
-    assert prior.motion is not None
-    assert prior.covariance is not None
-    covariance = prior.covariance.copy()
-    covariance[_TURNING] = 0.0
-    covariance[:, _TURNING] = 0.0
-    covariance[np.ix_(_TURNING, _TURNING)] = turn.error
-    still = replace(prior.motion, angular_velocity=np.zeros(3), angular_acceleration=np.zeros(3))
-    return replace(prior, motion=still, covariance=covariance)

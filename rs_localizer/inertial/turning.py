@@ -7,8 +7,8 @@ The gyroscope is off by ten numbers, of which the track knows a mean and a covar
     reading(t) = (I + S) M omega(t + d) + b + noise
 
 a bias ``b``, a delay ``d`` of its stamps, scales ``S`` of its axes and a turn ``M`` of its mount.
-A vibration whose phase nobody knows, because the delay is known no better than a part of its
-period, is no rotation that is known: rates are averaged over where the delay may lie.
+The rotation is a mean and a covariance of numbers that are linear in the rates. Delays are
+sampled, because a vibration is not linear in them: its mean square is then in the covariance.
 
 A gyroscope filters what it shows below half its sample rate, so its samples tell the rates between
 them; but a cubic spline through the samples loses 4 % of a vibration at 0.3 of the sample rate (3
@@ -22,36 +22,42 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
+from rs_localizer.core.arrays import Array, Array1, Array2
 from rs_localizer.core.blocks import median, write
-from rs_localizer.core.gyro_rotation import GyroRotation, turn_of
 from rs_localizer.core.rate_spline import rotations_at_knots, spline, turns_at
+from rs_localizer.core.rotation_prior import NODES, parts_of
+from rs_localizer.core.shake import COMBINATIONS, MIDDLE_RATES, RESOLVED, shake_functions
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.native import entry
 
 PARAMETERS = 10
 """Number of a gyroscope's errors; their places are BIAS, DELAY, SCALE and MOUNT."""
 BIAS, DELAY, SCALE, MOUNT = slice(0, 3), slice(3, 4), slice(4, 7), slice(7, 10)
-BETWEEN, RATE, CHANGE = slice(0, 3), slice(3, 6), slice(6, 9)
-"""Places of the turn since the last frame, the rate in this frame, and its change."""
+BETWEEN, WITHIN = slice(0, 3), slice(3, 63)
+"""Places of the turn since the last frame, and of what rotates within this frame: rate, change, and
+the coefficients of the in-frame turn (:mod:`rs_localizer.core.rotation_prior`)."""
 
 # Deviation (s) of stamps of single frames and samples beside a constant delay, at best.
 _JITTER = 4e-5
 # Error of a rotation beside scales and mount: axes that are not square, by data sheets.
 _SKEW = 0.003
-# The integral of white noise is a random walk. The least-squares parabola of one over an interval
-# of length 1 has a slope and a curvature of these variances (by its Legendre coefficients).
-_WALK_SLOPE, _WALK_CURVATURE = 6.0 / 5.0, 120.0 / 7.0
-# Squared mean and slope of a line through a vibration, to its mean square; at most.
-_WAVE_MEAN, _WAVE_SLOPE = 2.0, 120.0
+# Deviations of a delay to which it is looked at, and to how many delays at most.
+_REACH, _MOST_DELAYS = 2.5, 81
 # Share of the samples' period: shifts by less leave all that samples show.
 _SHORT = 0.3
-# s of a shift that rounding does not decide; and of squared rates.
-_LEAST_SHIFT, _TINY = 1e-6, 1e-30
+# s of a shift that rounding does not decide; (rad per readout)^2 of noise, likewise.
+_LEAST_SHIFT, _LEAST_NOISE = 1e-6, 1e-11
+# (rad per readout)^2 of the noise of rates, and size of an in-frame turn over an ordinary one: it
+# is as small as it can be beside a constant change of the rate.
+_USUAL_NOISE, _SIZE = 1e-13, 0.003
+# Row times at which rates are compared.
+_TAU = np.linspace(-0.5, 0.5, 41)
 
 # End of the spectrum, as a part of the sample rate, and noise beside it (variance).
 _BAND, _NOISE = 0.4, 1e-5
@@ -126,6 +132,25 @@ def densified(times: Array1, rates: Array2) -> tuple[Array, Array]:
     return dense, found
 
 
+def _parts_by_rates() -> tuple[Array, Array, Array]:
+    """Return how rates (n,) tell of a rate, its change and an in-frame turn.
+
+    Returns:
+        information (20,20) by rates of unit noise, and that of any rotation; derivatives (20,n) of
+        the numbers by rates with little noise.
+    """
+    rates = shake_functions(_TAU)[1] + MIDDLE_RATES
+    shown = np.column_stack([np.ones(len(_TAU)), _TAU, rates @ COMBINATIONS])
+    weights = np.gradient(_TAU)
+    known = (shown.T * weights) @ shown
+    prior = np.diag(np.repeat([1.0, _SIZE**-2], [2, RESOLVED]))
+    by_rates = np.linalg.solve(known + _USUAL_NOISE * prior, shown.T * weights)
+    return known, prior, by_rates
+
+
+_KNOWN, _PRIOR, _PARTS = _parts_by_rates()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class GyroscopeErrors:
     """Errors of a gyroscope, as far as they are known."""
@@ -150,33 +175,32 @@ class GyroscopeErrors:
         turned: Array = shown @ so3.exp(np.ascontiguousarray(self.mean[MOUNT])).T
         return np.ascontiguousarray(turned)
 
-    def derivative(self, rate: Array) -> Array:
-        """Return the derivative (3,10) of a corrected rate (3,) by all but the delay."""
+    def derivatives(self, rates: Array) -> Array:
+        """Return the derivatives (n,3,10) of corrected rates (n,3) by all but the delay."""
         mount, scale = so3.exp(np.ascontiguousarray(self.mean[MOUNT])), 1.0 + self.mean[SCALE]
-        by_errors = np.zeros((3, PARAMETERS))
-        by_errors[:, BIAS] = -mount / scale
-        by_errors[:, SCALE] = -mount * (mount.T @ rate) / scale
-        by_errors[:, MOUNT] = -so3.hat(rate)
+        rates = np.atleast_2d(rates)
+        by_errors = np.zeros((len(rates), 3, PARAMETERS))
+        by_errors[..., BIAS] = -mount / scale
+        by_errors[..., SCALE] = -mount * (rates @ mount)[:, None] / scale
+        by_errors[..., MOUNT] = -so3.hat(rates)
         return by_errors
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Rotated:
-    """The rotation by a gyroscope, and how it depends on what is not known of that."""
+class Read(NamedTuple):
+    """The rotation by a gyroscope's readings, and how it depends on what is not known of that."""
 
-    known: GyroRotation  # within the frame
+    rate: Array  # (3,) in the frame, see RotationPrior
+    change: Array  # (3,)
+    shake: Array  # (28,3)
     between: Array | None  # (3,3) camera_then_from_camera_now
-    # (9,10) of the turn since the last frame, in the axes of then, and of rate and change that the
-    # known rotation leaves, per readout
-    by_errors: Array
-    variances: Array  # (9,) of what else is not known
-    swing: Array  # (3,) rad^2, variances of the turn by vibration whose phase is not known
+    by_errors: Array  # (63,10) of BETWEEN and WITHIN
+    rest: Array  # (63,63) covariance of what else is not known
 
 
-def rotated(
+def read(
     samples: ImuSamples, middle_ns: int, readout_time: float, errors: GyroscopeErrors,
     since_ns: int | None = None,
-) -> Rotated | None:  # fmt: skip
+) -> Read | None:  # fmt: skip
     """Return the rotation in a frame and since a moment before; None: samples do not cover it.
 
     Args:
@@ -186,100 +210,78 @@ def rotated(
     """
     here_ns, half = middle_ns - round(1e9 * errors.time_offset), 0.5 * readout_time
     length = 0.0 if since_ns is None else 1e-9 * (middle_ns - since_ns)
-    before = max(length, half)
-    span = samples.around(here_ns - round(1e9 * before), here_ns + round(1e9 * half))
+    span = samples.around(here_ns - round(1e9 * max(length, half)), here_ns + round(1e9 * half))
     if span is None:
         return None
-    deviation = math.hypot(math.sqrt(errors.covariance[DELAY, DELAY].item()), _JITTER)
-    reach_ns = round(2e9 * deviation)
+    deviation = math.hypot(math.sqrt(errors.covariance[DELAY, DELAY].item()), _LEAST_SHIFT)
+    reach_ns = round(_REACH * 1e9 * deviation)
     first = int(samples.times_ns.searchsorted(samples.times_ns[span.start] - reach_ns))
     last = int(samples.times_ns.searchsorted(samples.times_ns[span][-1] + reach_ns, "right"))
     times = np.asarray(1e-9 * (samples.times_ns[first:last] - here_ns), np.float64)
-    rates = errors.corrected(samples.angular_velocity[first:last])
     period = float(times[-1] - times[0]) / (len(times) - 1)
-    # Samples may not reach as far as the delay may.
-    shift = max(min(deviation, times[-1] - half, -before - times[0]), _LEAST_SHIFT)
-    dense, found = _densified(times, rates)
-    near = (dense >= times[span.start - first]) & (dense <= times[min(span.stop, last) - 1 - first])
-    rough, swing = np.zeros(3), np.zeros(3)
-    if shift > _SHORT * period:
-        smooth, rough, swing = _averaged(dense, found, shift, near)
-        found, rough = smooth, rough * readout_time**2
-    dense, found = dense[near], found[near]
-    by_errors, variances = np.zeros((9, PARAMETERS)), np.zeros(9)
-    # Turn since the last frame, rate and change by samples that are so much later.
-    shown = np.array([_shown(dense, found, length, half, late) for late in (-shift, 0.0, shift)])
-    by_errors[:, DELAY] = -0.5 / shift * (shown[2] - shown[0])[:, None]
-    variances += (0.5 * (shown[2] + shown[0]) - shown[1]) ** 2
-    variances += (_JITTER * by_errors[:, DELAY.start]) ** 2
+    dense, found = _densified(times, errors.corrected(samples.angular_velocity[first:last]))
+    delays, weights = _delays(deviation, period)
+    # All that follows is by readings that are so much later.
+    grid = readout_time * _TAU
+    cubics = spline(dense, found)
+    knots = rotations_at_knots(dense, cubics)
+    moments = np.append(grid, [0.0, -length]) + delays[:, None]
+    _, rates = turns_at(np.clip(moments, dense[0], dense[-1]).ravel(), dense, cubics, knots)
+    rates = readout_time * rates.reshape(*moments.shape, 3)
+    slopes, rates = (rates[:, -2] - rates[:, -1]) / readout_time, rates[:, :-2]
+    late = np.einsum("pg,dgx->dpx", _PARTS, rates).reshape(len(delays), -1)
+    # From the last frame to this one, beside a constant.
+    steps = 0.5 * (slopes[1:] + slopes[:-1]) * np.diff(delays)[:, None]
+    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    every = np.hstack([turned, late])
+    mean = weights @ every
+    off, by_errors = every - mean, np.zeros((every.shape[1], PARAMETERS))
+    by_errors[:, DELAY] = -((weights * delays) @ off)[:, None] / (weights @ delays**2)
+    off += np.outer(delays, by_errors[:, DELAY.start])
+    rest = (off.T * weights) @ off
+    if len(delays) > 3:
+        found = np.einsum("d,dtx->tx", weights, _at(dense + delays[:, None], dense, found))
+        cubics = spline(dense, found)
+        knots = rotations_at_knots(dense, cubics)
+    turns, _ = turns_at(np.append(readout_time * NODES, -length), dense, cubics, knots)
+    within = readout_time * errors.derivatives(
+        np.einsum("d,dgx->gx", weights, rates) / readout_time
+    )
+    by_errors[WITHIN] += np.einsum("pg,gxe->pxe", _PARTS, within).reshape(-1, PARAMETERS)
+    rest[WITHIN, WITHIN] += _noise(errors.noise**2 * readout_time)
     between = None
     if length > 0.0:
-        cubics = spline(dense, found)
-        turns, _ = turns_at(
-            np.array([-length, 0.0]), dense, cubics, rotations_at_knots(dense, cubics)
-        )
-        between = np.ascontiguousarray(turns[1] @ turns[0].T)
-        angle = so3.log(np.ascontiguousarray(between.T))
+        between = np.ascontiguousarray(turns[-1].T)
+        angle = so3.log(np.ascontiguousarray(turns[-1]))
         # A constant rate in the camera's axes of each moment, seen in those of then.
         by_rate = length * so3.right_jacobian(angle)
-        by_errors[BETWEEN] += by_rate @ errors.derivative(angle / length)
-    unit = readout_time
-    by_errors[RATE] += unit * errors.derivative(shown[1][RATE] / unit)
-    by_errors[CHANGE] += unit * errors.derivative(shown[1][CHANGE] / unit)
-    by_errors[CHANGE, BIAS] = 0.0
-    variances += _SKEW**2 * np.repeat(np.square(shown[1]).reshape(3, 3).sum(axis=1), 3)
-    walk = errors.noise**2
-    variances += walk * np.repeat(
-        [length, _WALK_SLOPE * readout_time, _WALK_CURVATURE * readout_time], 3
-    )
-    variances += np.concatenate([_WAVE_MEAN * swing, _WAVE_MEAN * rough, _WAVE_SLOPE * rough])
-    within = slice(BETWEEN.stop, None)
-    error = by_errors[within] @ errors.covariance @ by_errors[within].T
-    error[np.diag_indices(6)] += variances[within]
-    static = by_errors[RATE].copy()
-    static[:, DELAY] = 0.0
-    tau = dense / readout_time
-    known = GyroRotation(
-        tau, *turn_of(tau, found * readout_time), error,
-        errors.noise * readout_time / math.sqrt(period), deviation / readout_time,
-        static @ errors.covariance @ static.T + np.diag(rough),
-    )  # fmt: skip
-    return Rotated(known, between, by_errors, variances, swing)
+        by_errors[BETWEEN] += by_rate @ errors.derivatives(angle / length)[0]
+        mean[BETWEEN] = angle
+        rest[BETWEEN, BETWEEN] += errors.noise**2 * length * np.eye(3)
+    squares = np.square(mean).reshape(-1, 3).sum(axis=1)
+    rest[np.diag_indices(len(rest))] += _SKEW**2 * np.repeat(squares, 3)
+    rest += _JITTER**2 * np.outer(by_errors[:, DELAY.start], by_errors[:, DELAY.start])
+    return Read(*parts_of(turns[:-1]), between, by_errors, rest)
 
 
-def _averaged(
-    times: Array, rates: Array, deviation: float, near: BoolArray
-) -> tuple[Array, Array, Array]:
-    """Average rates (n,3) over a normal shift of their times (n,).
-
-    Returns:
-        averages; of those that are near, variances (3,) about the average, but for what goes with
-        the shift, and of the turns to and fro that these make.
-    """
-    weights = np.gradient(times) * np.exp(-0.5 * ((times[:, None] - times) / deviation) ** 2)
-    weights /= weights.sum(axis=1)[:, None]
-    averaged = weights @ rates
-    # The part that is linear in the shift is left out.
-    along = deviation * np.gradient(averaged, times, axis=0)
-    spread = (weights @ rates**2 - averaged**2 - along**2)[near]
-    rough = np.maximum(spread.mean(axis=0), 0.0)
-    left = (rates - averaged)[near]
-    turned = np.cumsum(left * np.gradient(times[near])[:, None], axis=0)
-    return averaged, rough, rough * turned.var(axis=0) / np.maximum((left**2).mean(axis=0), _TINY)
+def _delays(deviation: float, period: float) -> tuple[Array, Array]:
+    """Return delays (d,) and weights of a normal deviate: three, if readings change as little."""
+    if deviation <= _SHORT * period:
+        return deviation * math.sqrt(3.0) * np.array([-1.0, 0.0, 1.0]), np.array([1, 4, 1]) / 6.0
+    count = min(math.ceil(2.0 * _REACH * deviation / period), _MOST_DELAYS // 2)
+    delays = _REACH * deviation * np.linspace(-1.0, 1.0, 2 * count + 1)
+    weights = np.exp(-0.5 * (delays / deviation) ** 2)
+    return delays, weights / weights.sum()
 
 
-def _shown(times: Array, rates: Array, length: float, half: float, late: float) -> Array:
-    """Return what rates say (9,) if they come so much later.
+def _at(wanted: Array, times: Array, values: Array) -> Array:
+    """Return values (...,3) between those (n,3) at times (n,); beyond them the last one."""
+    found = [np.interp(wanted, times, values[:, axis]) for axis in range(3)]
+    return np.stack(found, axis=-1)
 
-    That is the turn over a length until time 0, and mean rate and its change over a readout, of so
-    much on both sides of it, per readout. Axes are those of each moment: how they turn meanwhile
-    makes no difference to a small shift.
-    """
-    steps = 0.5 * (rates[1:] + rates[:-1]) * np.diff(times)[:, None]
-    angles = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    wanted = np.array([-length, -half, 0.0, half]) + late
-    at = np.clip(np.searchsorted(times, wanted) - 1, 0, len(times) - 2)
-    since, step = (wanted - times[at])[:, None], (times[at + 1] - times[at])[:, None]
-    bend = 0.5 * since**2 / step * (rates[at + 1] - rates[at])
-    past, first, middle, last = angles[at] + since * rates[at] + bend
-    return np.concatenate([middle - past, last - first, 4.0 * (last - 2.0 * middle + first)])
+
+@cache
+def _noise(variance: float) -> Array:
+    """Return the covariance (60,60) of a rotation by the white noise of its rate."""
+    noisy = _KNOWN / max(variance, _LEAST_NOISE) + _PRIOR
+    return np.kron(np.linalg.inv(noisy), np.eye(3))

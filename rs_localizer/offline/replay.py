@@ -389,7 +389,7 @@ def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterato
 
     def awaits(item: tuple[str, int, Any]) -> bool:
         topic, _, message = item
-        return topic == topics.frames and localizer.awaits_imu(stamp_ns(message), LOOK_AHEAD)
+        return topic == topics.frames and localizer.awaits_readings(stamp_ns(message), LOOK_AHEAD)
 
     def answer(recorded_ns: int, message: Any, result: Localized | Refusal) -> Answer:
         if result and localizer.config.output_lag > 0:  # of a frame that has waited

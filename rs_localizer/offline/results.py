@@ -41,8 +41,8 @@ from rs_localizer.io.transforms import TransformError, make_transform
 from rs_localizer.offline.fleet import Figures
 from rs_localizer.offline.frame_table import FrameTable
 from rs_localizer.offline.replay import NO_FRAMES, TF_TYPE, Answer, Topics, replay
+from rs_localizer.pipeline.aid import AidState
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.imu_readings import ImuState
 from rs_localizer.pipeline.map_to_odom import CorrectionState
 from rs_localizer.pipeline.published import broadcast
 from rs_localizer.pipeline.refusal import Refusal
@@ -153,7 +153,7 @@ class Tally:
     moving: bool = False  # whether there are twists
     smoothed: Counter[str] | None = None  # what became of the moments of one that was smoothed
     bridged: array[int] = field(default_factory=lambda: array("q"))  # ns, without an image
-    imu: ImuState | None = None
+    aid: AidState | None = None
     readout: tuple[float, float] | None = None  # s, as the motion shows it, and its deviation
     _stamps_ns: array[int] = field(default_factory=lambda: array("q"))  # of the images
     _numbers: array[float] = field(default_factory=lambda: array("d"))
@@ -187,7 +187,7 @@ class Tally:
             # Images of several cameras are one frame.
             lost = sum(n for reason, n in self.refused.items() if reason not in NO_FRAMES)
             self.total = self.localized + lost
-        self.imu = localizer.imu.state
+        self.aid = localizer.aid.state
         if (measured := localizer.shutter.measured) is not None:
             self.readout = measured.readout_time, measured.deviation
 
@@ -306,16 +306,8 @@ def summary(tally: Tally, config: NodeConfig, timed: bool = True) -> list[str]:
         ]
         if rolling:
             rows.append(("tracked from the frame before", f"{tally.column('tracked').mean():.1%}"))
-    if (imu := tally.imu) is not None:
-        rows.append(("localized with the IMU", f"{imu.used / imu.frames:.1%}"))
-        rows += [(f"  without: {reason}", count) for reason, count in imu.reasons.items()]
-        if imu.used and imu.status is not None and np.isfinite(imu.time_offset):
-            bias = np.linalg.norm(np.degrees(imu.status.bias))
-            rows.append(("  bias of the gyroscope (deg/s)", f"{bias:.2f}"))
-            offset, deviation = 1e3 * imu.time_offset, 1e3 * imu.status.time_offset_deviation
-            rows.append(("  time offset of the IMU (ms)", f"{offset:.2f} +- {deviation:.2f}"))
-            if imu.status.oddity:
-                rows.append(("  said by the camera's rotation:", imu.status.oddity))
+    if tally.aid is not None:
+        rows += tally.aid.rows()
     if timed:
         rows.append(("frames per second", f"{tally.total / tally.seconds:.0f}"))
     if (smoothed := tally.smoothed) is not None:
@@ -326,7 +318,7 @@ def summary(tally: Tally, config: NodeConfig, timed: bool = True) -> list[str]:
             ("  vibrating, left as they were", smoothed["shaken"]),
         ]
     lines = [f"{name:40} {text!s:>8}" for name, text in rows]
-    reasons = (*tally.refused, *(tally.imu.reasons if tally.imu else ()))
+    reasons = (*tally.refused, *(tally.aid.reasons if tally.aid else ()))
     sentences: dict[str, str] = {it: f"{it.means}; {it.look_at}" for it in reasons}
     for name, text in (
         sentences | {name: text for name, (_, text) in tally.notices.items()}

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -27,15 +27,12 @@ from rs_localizer.io.clouds import (
 from rs_localizer.io.outputs import Localized
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline import what_fits
+from rs_localizer.pipeline.aid import Moment, aid_of
 from rs_localizer.pipeline.cloud_checks import stale_landmarks
 from rs_localizer.pipeline.frames import FrameLocalizer, is_timed
-from rs_localizer.pipeline.imu_readings import Moment, inertial_settings
 from rs_localizer.pipeline.pose_at_time import middle_row_ns, published_moment
 from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
 from rs_localizer.tracking import FrameContext, Tracker
-
-if TYPE_CHECKING:
-    from rs_localizer.inertial.samples import ImuSamples
 
 # From this chance on of a wrong pose or map, it is more probable than not.
 DOUBTFUL = 0.5
@@ -48,9 +45,9 @@ class CameraFrames(FrameLocalizer):
         (camera,) = cameras.values()
         timed = is_timed(config, cameras)
         tracks = config.tracking and timed
-        inertial = inertial_settings(config) if timed else None
+        aid = aid_of(config, camera) if timed else None
         lag = config.output_lag if tracks else 0
-        return Tracker(Localizer(camera, config), inertial, tracks, lag, config.max_prediction)
+        return Tracker(Localizer(camera, config), aid, tracks, lag, config.max_prediction)
 
     def _forget_frames(self) -> None:
         # Of the last frames, by time of the middle row: with what their results are published.
@@ -80,12 +77,12 @@ class CameraFrames(FrameLocalizer):
         corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
         return self._camera.bearings(corners)
 
-    def awaits_imu(self, stamp_ns: int, patience: float) -> bool:
+    def awaits_readings(self, stamp_ns: int, patience: float) -> bool:
         """Return True if readings of the frame with this stamp may come within so many seconds."""
-        return self.imu.awaits(self._moment(self._middle_row_ns(stamp_ns)), patience)
+        return self.aid.awaits(self._moment(self._middle_row_ns(stamp_ns)), patience)
 
     def _moment(self, time_ns: int) -> Moment:
-        """Return what readings of the IMU at a time are for."""
+        """Return what readings at a time are for."""
         return Moment(self._tracker, self._config, time_ns, self.camera_frame, self.transforms)
 
     def localize(self, message: Any) -> Localized | Refusal | None:
@@ -150,11 +147,11 @@ class CameraFrames(FrameLocalizer):
         time_ns, context = self._middle_row_ns(cloud.stamp_ns), self._context
         self._expect(time_ns, cloud.frame)
 
-        def localized(samples: ImuSamples | None) -> Estimate | Failure:
+        def localized(samples: Any) -> Estimate | Failure:
             matches = cloud.points, cloud.pixels, cloud.scores
-            return self._tracker.localize(time_ns, *matches, imu=samples, context=context)
+            return self._tracker.localize(time_ns, *matches, readings=samples, context=context)
 
-        self.imu.track(self._moment(time_ns), localized)
+        self.aid.track(self._moment(time_ns), localized)
         result = self._tracker.newest
         assert result is not None
         if result:
@@ -262,7 +259,7 @@ class CameraFrames(FrameLocalizer):
             return None
         newest_ns, samples = self._tracker.newest_ns, None
         if newest_ns is not None and stamp_ns > newest_ns:
-            samples = self.imu.ahead(self._moment(stamp_ns))
+            samples = self.aid.ahead(self._moment(stamp_ns))
         found = self._tracker.at(stamp_ns, samples)
         if found is None:
             return None

@@ -17,8 +17,6 @@ from typing import TYPE_CHECKING
 
 from rs_localizer.config import (
     CameraSettings,
-    Imu,
-    ImuUse,
     NodeConfig,
     PublishTf,
     RefinementKind,
@@ -34,9 +32,9 @@ from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import CAMERA_INFO, MAP_POINTS
 from rs_localizer.io.transforms import Transforms, TransformTree
 from rs_localizer.pipeline import what_fits
+from rs_localizer.pipeline.aid import AidInput, without_aid, without_wait
 from rs_localizer.pipeline.cloud_checks import oddities
 from rs_localizer.pipeline.given_pose import GivenPose, PosePrior
-from rs_localizer.pipeline.imu_readings import ImuInput
 from rs_localizer.pipeline.keypoint_map import Landmarks, read_landmarks
 from rs_localizer.pipeline.published import ReadoutKnown, of_body, of_camera
 from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
@@ -67,10 +65,7 @@ _BESIDE = frozenset({
 
 def _of_estimates(config: NodeConfig) -> tuple[object, ...]:
     rig = config.rig if config.of_cameras else type(config.rig)()
-    imu = replace(config.imu, wait=0.0)
-    if config.of_cameras or imu.use == ImuUse.NONE:  # nothing else of it is read
-        imu = Imu(use=ImuUse.NONE)
-    config = replace(config, imu=imu, rig=rig)
+    config = replace(without_wait(config), rig=rig)
     return tuple(getattr(config, it.name) for it in fields(config) if it.name not in _BESIDE)
 
 
@@ -96,7 +91,7 @@ class FrameLocalizer(ABC):
     ) -> None:
         self._notice = notice
         self.transforms: Transforms = TransformTree() if transforms is None else transforms
-        self.imu: ImuInput = ImuInput(notice)
+        self.aid: AidInput = AidInput(notice)
         self.calibrations: dict[str, Calibration] = {}
         """What the last usable camera_info of each camera said; of one without a name: ``""``."""
         self._landmarks = Landmarks(notice)
@@ -127,7 +122,7 @@ class FrameLocalizer(ABC):
     def change(self, config: NodeConfig) -> bool:
         """Use these settings from the next frame on; whether they start the track afresh.
 
-        What no frame's estimate depends on, as of outputs and transforms, leaves track, IMU and
+        What no frame's estimate depends on, as of outputs and transforms, leaves track, aid and
         shutter watch as they are.
         """
         config = _in_effect(config)
@@ -225,7 +220,7 @@ class FrameLocalizer(ABC):
         self.calibrations[name] = calibration
         self._apply_settings(self._config)
 
-    def awaits_imu(self, stamp_ns: int, patience: float) -> bool:
+    def awaits_readings(self, stamp_ns: int, patience: float) -> bool:
         """Return True if readings of this frame may come within this many seconds."""
         return False
 
@@ -305,7 +300,7 @@ def _in_effect(config: NodeConfig) -> NodeConfig:
     """
     if config.refinement == RefinementKind.FULL:
         return config
-    config = replace(config, tracking=False, imu=replace(config.imu, use=ImuUse.NONE))
+    config = replace(without_aid(config), tracking=False)
     if config.refinement == RefinementKind.NONE:
         config = replace(config, publish_tf=PublishTf.NONE)
     return config

@@ -24,7 +24,7 @@ from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.transforms import Transform, TransformError, from_numbers
-from rs_localizer.pipeline.imu_readings import Moment
+from rs_localizer.pipeline.aid import Moment
 from rs_localizer.pipeline.refusal import Notify
 
 # Deviations (m, rad) that a variance of zero stands for: RViz leaves z, roll and pitch at zero.

@@ -130,7 +130,7 @@ _ROWS = (
         "the IMU beside the camera",
         Role.SAMPLES,
         read=read_imu,
-        use=lambda localizer, reading: localizer.imu.add(reading),
+        use=lambda localizer, reading: localizer.aid.add(reading),
         refused=Reason.BAD_IMU,
     ),
     Input(

@@ -23,10 +23,6 @@ acceleration are left out.
 
 Vibration rotates the camera by ``delta(tau)`` in its own axes beside this motion. Its coefficients
 stand behind the motion in the estimate's covariance, and its rotation and rate are linear in them.
-The rotation of a gyroscope comes last: the equations hold for the motion beside it, which is then
-rotated by it. The gyroscope's noise at one moment is added to that of the angular velocity. Its
-time offset may leave the motion beside the rotation to the points. If the gyroscope alone then
-knows the angular velocity better than both together, its own is published.
 """
 
 from dataclasses import replace
@@ -36,7 +32,6 @@ import numpy as np
 from rs_localizer.config import Acceleration, NodeConfig, PoseTime
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.gyro_rotation import NO_TURN, Turning
 from rs_localizer.core.moment_kernels import pose_of, twist_of
 from rs_localizer.core.shutter import Numbers, numbers_of
 from rs_localizer.core.state import MOTION_PARAMETERS
@@ -62,12 +57,11 @@ def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
     )
 
 
-def _numbers(estimate: Estimate, tau: float) -> tuple[Numbers, Array, Array, Turning, float]:
+def _numbers(estimate: Estimate, tau: float) -> tuple[Numbers, Array, Array, float]:
     """Return the numbers of an estimate at a row time, as kernels take them."""
-    turn = NO_TURN if estimate.turn is None else estimate.turn.numbers
     joint = np.ascontiguousarray(estimate.joint_covariance.copy())
     joint[:MOTION_PARAMETERS, :MOTION_PARAMETERS] = estimate.covariance
-    return numbers_of(estimate), np.ascontiguousarray(estimate.shake), joint, turn, float(tau)
+    return numbers_of(estimate), np.ascontiguousarray(estimate.shake), joint, float(tau)
 
 
 def with_timing(

@@ -133,7 +133,7 @@ def of_camera(
     readout_time = estimate.span
     stamp_ns, tau = moment
     moving = readout_time > 0.0 and find_solver(config.solver).rolling_shutter
-    if readout.global_shutter and estimate.turn is None:
+    if readout.global_shutter and not estimate.aided:
         moving = False  # an image says nothing of velocities
     pose = pose_at(estimate, tau)
     twist = twist_at(estimate, tau, readout_time) if moving else None

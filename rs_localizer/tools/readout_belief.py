@@ -63,7 +63,7 @@ class Block:
     deviation: float  # s
     camera: Camera  # with the lens of this part
     landmarks: Array  # (p,3) m, with the shape that this part finds
-    delay: float = math.nan  # s, of the gyroscope where there is one
+    delay: float = math.nan  # s, of the readings where there are some
     delay_deviation: float = math.nan  # s
 
 

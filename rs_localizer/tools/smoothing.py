@@ -22,7 +22,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.rig import Rig
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
-from rs_localizer.core.types import Estimate
+from rs_localizer.core.types import Estimate, roughness
 from rs_localizer.tools.adjust.fit import Fit, cheaper, solve
 from rs_localizer.tools.adjust.motion import acceleration_rows
 from rs_localizer.tools.adjust.observe import ImagePoints, collect
@@ -76,7 +76,7 @@ _FADING = 0.1
 # standard deviations) of its points. Where so much of the frames is, the motion between them is
 # none.
 _SHAKEN, _SHAKEN_SIGMAS, _MOST_SHAKEN = 1.5, 5.0, 0.2
-# rad per readout that gyroscopes see beside a parabola: vibration.
+# rad per readout that is known beside a parabola: vibration.
 _ROUGH = 2e-3
 # So are frames whose own in-frame turns move their points by more than their residual, as most of
 # those next to them do: of a hand, 65 points at 1 px, at most one in twenty does by chance, of 0.3
@@ -280,8 +280,8 @@ def _shaken(fitted: Fit, parts: Parts, focal_length: float, estimates: list[Esti
     freedom = np.maximum(1.0 - PARAMETERS / np.maximum(2 * count, 1), 0.1)
     limit = np.maximum(_SHAKEN**2, 1.0 + _SHAKEN_SIGMAS / np.sqrt(np.maximum(count, 1)))
     shaken = (count > 0) & (off > limit * own / freedom)
-    # Or their gyroscopes know it.
-    rough = [one.turn is not None and one.turn.roughness > _ROUGH for one in estimates]
+    # Or more than their points tells of it.
+    rough = [one.aided and roughness(one) > _ROUGH for one in estimates]
     return np.asarray(shaken | rough | _turns_in_frame(focal_length, estimates), np.bool_)
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.core.gyro_rotation import GyroRotation
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shake import FUNCTIONS
 from rs_localizer.core.types import Estimate, Failure
@@ -23,8 +22,8 @@ def turned(vector):
     return Rotation.from_rotvec(vector).as_matrix()
 
 
-def some_estimate(shaken=0, gyroscope=False, speed=0.2, acceleration=0.3):
-    """An estimate with a random covariance; beside a gyroscope, with its rotation."""
+def some_estimate(shaken=0, speed=0.2, acceleration=0.3):
+    """An estimate with a random covariance."""
     rng = np.random.default_rng(3)
     half = 1e-3 * rng.normal(size=(18 + 3 * shaken, 18 + 3 * shaken))
     half[18:] *= 0.1  # vibration makes ten times as much of the angular velocity
@@ -32,7 +31,7 @@ def some_estimate(shaken=0, gyroscope=False, speed=0.2, acceleration=0.3):
     if shaken:
         shake = np.zeros((FUNCTIONS, 3))
         shake[:shaken] = 0.01 * rng.normal(size=(shaken, 3))
-    found = Estimate(
+    return Estimate(
         turned(rng.normal(size=3)), np.array([0.1, -0.2, 3.0]), *(speed * rng.normal(size=(2, 3))),
         angular_acceleration=acceleration * rng.normal(size=3),
         linear_acceleration=acceleration * rng.normal(size=3),
@@ -40,28 +39,15 @@ def some_estimate(shaken=0, gyroscope=False, speed=0.2, acceleration=0.3):
         joint_covariance=half @ half.T, iterations=0,
         shake=shake[:shaken], span=SPAN, time_ns=10**12,
     )  # fmt: skip
-    turn = GyroRotation.of(TAU, RATES, rate_noise=0.01)
-    return beside(found, turn) if gyroscope else found
-
-
-def beside(found, turn):
-    """An estimate with the known turn beside which it was found."""
-    return replace(
-        found, turn=turn, angular_velocity=found.angular_velocity + turn.rate,
-        angular_acceleration=found.angular_acceleration + turn.change,
-    )  # fmt: skip
 
 
 def centre(pose):
     return -pose[0].T @ pose[1]
 
 
-KINDS = [(0, False), (4, False), (0, True), (4, True)]
-
-
-@pytest.mark.parametrize(("shaken", "gyroscope"), KINDS)
-def test_velocities_are_the_derivatives_of_the_poses(shaken, gyroscope):
-    estimate, h = some_estimate(shaken, gyroscope), 1e-5
+@pytest.mark.parametrize("shaken", [0, 4])
+def test_velocities_are_the_derivatives_of_the_poses(shaken):
+    estimate, h = some_estimate(shaken), 1e-5
     for tau in (-0.4, 0.0, 0.3):
         before, now, after = (estimate.at(tau + step) for step in (-h, 0.0, h))
         velocity = now[0] @ (centre(after) - centre(before)) / (2.0 * h)
@@ -84,7 +70,6 @@ def nearby(estimate, step):
     """The estimate that is off by a step (18 + 3 k,), as its class says what the numbers are."""
     off, shaken = np.split(step, [18])
     off = off.reshape(6, 3)
-    # Beside a gyroscope, the motion without its rotation is what has these errors.
     rotation = turned(-off[0]) @ estimate.rotation
     position = estimate.position + estimate.rotation.T @ off[1]
     return replace(
@@ -137,18 +122,6 @@ def test_beyond_the_rows_vibration_goes_on_in_an_unknown_phase():
             for one in (calm, shaken)
         ]
         assert grown[1] > grown[0]
-    aided = some_estimate(gyroscope=True)
-    rates = [np.trace(aided.at_time(s).covariance[6:9, 6:9]) for s in (0.0, 0.015, 0.04)]
-    assert rates[0] < rates[2]
-    assert rates[1] < rates[2]
-
-
-def test_the_gyroscope_is_taken_away_as_it_was_given():
-    found, plain = some_estimate(gyroscope=True), some_estimate()
-    alone = found.without_gyro()
-    np.testing.assert_allclose(alone.angular_velocity, plain.angular_velocity, atol=1e-15)
-    np.testing.assert_allclose(alone.angular_acceleration, plain.angular_acceleration, atol=1e-15)
-    assert plain.without_gyro() is plain
 
 
 def test_what_a_result_says_of_itself():

@@ -65,8 +65,8 @@ def test_speeding_counts_what_the_configuration_expects():
     np.fill_diagonal(information[6:9, 6:9], 0.1**-2)
     np.fill_diagonal(information[9:12, 9:12], 0.01**-2)
     observed = SimpleNamespace(
-        sighted=SimpleNamespace(turn=None), terms=SimpleNamespace(informations=[information])
+        sighted=SimpleNamespace(rotation=None), terms=SimpleNamespace(informations=[information])
     )
     assert speeding(observed, state) == pytest.approx(5.0 + 9.0)
-    observed.sighted.turn = "of a gyroscope"
+    observed.sighted.rotation = "of a gyroscope"
     assert speeding(observed, state) == pytest.approx(9.0)

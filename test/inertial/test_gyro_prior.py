@@ -59,12 +59,12 @@ def around(recorded, frame):
 
 def followed(recorded, frames=60, change=lambda samples: samples):
     """The gyroscope's status after each frame, and the results."""
-    tracker = Tracker(Localizer(believed(recorded.frames.camera)), recorded.settings)
+    tracker = Tracker(Localizer(believed(recorded.frames.camera)), recorded.aid())
     found = []
     for frame in range(frames):
         seen, samples = recorded.frames.seen(frame, 1.0), change(around(recorded, frame))
-        result = tracker.localize(recorded.frames.middle_ns(frame), *seen, imu=samples)
-        found.append((tracker.inertial, result))
+        result = tracker.localize(recorded.frames.middle_ns(frame), *seen, readings=samples)
+        found.append((tracker.aid.status, result))
     return found
 
 
@@ -131,7 +131,7 @@ def test_the_bias_is_found(held):
     status, result = followed(held)[-1]
     assert status.unused is None
     assert status.oddity == ""
-    assert result.turn is not None
+    assert result.aided
     assert 0.1 < np.degrees(np.linalg.norm(status.bias)) < 0.9  # of 0.5
     assert np.degrees(status.bias_deviation) < 0.2
 
@@ -151,12 +151,12 @@ def test_upside_down_is_left_out(held):
 
 def test_behind_the_last_row_the_camera_turns_on(held):
     """Readings of later than the middle row have not come: the frame's own rows say it."""
-    tracker = Tracker(Localizer(believed(held.frames.camera)), held.settings)
+    tracker = Tracker(Localizer(believed(held.frames.camera)), held.aid())
     half = round(0.5e9 * Camera().readout_time)
     off = []
     for frame in range(60):
         samples, middle = held.around(frame), held.frames.middle_ns(frame)
-        tracker.localize(middle, *held.frames.seen(frame, 1.0), imu=samples)
+        tracker.localize(middle, *held.frames.seen(frame, 1.0), readings=samples)
         here = int(np.searchsorted(samples.times_ns, middle))
         late = ImuSamples(samples.times_ns[:here], samples.angular_velocity[:here])
         moved = [tracker.at(middle + half + 1_000_000, heard) for heard in (late, samples)]

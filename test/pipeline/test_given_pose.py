@@ -13,8 +13,8 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.messages import MessageError, make_header, make_quaternion, make_vector
 from rs_localizer.io.transforms import Transform, TransformTree, make_transform
+from rs_localizer.pipeline.aid import Moment
 from rs_localizer.pipeline.given_pose import PosePrior, read_given_pose
-from rs_localizer.pipeline.imu_readings import Moment
 
 SECOND = 10**9
 CONFIG = NodeConfig(readout_time=0.03, base_frame="base_link")

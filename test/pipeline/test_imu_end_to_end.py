@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 START_NS = 1_000_000_000_000
 WIDTH, HEIGHT, FOCAL, CENTRE = 640, 480, 450.0, np.array([320.0, 240.0])
-READOUT_TIME, STAMP_OFFSET, IMU_OFFSET = 0.03, 0.005, 0.007  # s
+READOUT_TIME, STAMP_OFFSET, IMU_OFFSET = 0.03, -0.005, 0.007  # s
 RATE, IMU_RATE, FRAMES, SETTLED = 30.0, 400.0, 45, 20
 VIBRATION, FREQUENCY = np.radians(0.3), 2.0 * np.pi * 60.0
 CAMERA_FROM_IMU = Rotation.from_euler("xyz", [40, -70, 120], degrees=True)
@@ -140,19 +140,19 @@ def test_pose_and_twist_are_right_whatever_is_turned_or_late(direction, make_cam
             noise = rng.normal(scale=2e-4 * np.sqrt(IMU_RATE), size=3)
             rate = CAMERA_FROM_IMU.inv().apply(turn_rate(now)) + BIAS + noise
             stamp_ns = START_NS + round(1e9 * (heard - IMU_OFFSET))
-            localizer.imu.add(read_imu(measured(stamp_ns, rate)))
+            localizer.aid.add(read_imu(measured(stamp_ns, rate)))
             heard += 1.0 / IMU_RATE
         found = localizer.localize(cloud(seconds, direction, rng))
         off.append(errors_of(found))
         middle = START_NS + round(1e9 * (seconds + STAMP_OFFSET + 0.5 * READOUT_TIME))
         # The readings go on for 150 ms.
         ahead.append(errors_of(localizer.at(middle + 90_000_000)))
-    assert localizer.imu.state is not None
-    assert localizer.imu.state.share > 0.8
+    assert localizer.aid.state is not None
+    assert localizer.aid.state.share > 0.8
     orientation, metres, angular, linear = np.median(off[SETTLED:], axis=0)[:4]
     assert np.degrees(orientation) < 0.1
     assert metres < 0.003
-    # The stamp lies 5 ms before the first row, and the vibration turns at 113 deg/s.
+    # The stamp lies 5 ms behind the first row, and the vibration turns at 113 deg/s.
     assert np.degrees(angular) < 1.5
     assert linear < 0.1  # m/s
     # Six are expected; what the gyroscope is off by, by two deviations at most, is always the same.

@@ -25,8 +25,8 @@ from rs_localizer.io.outputs import Localized
 from rs_localizer.io.trajectories import read_motions
 from rs_localizer.io.transforms import Transform, TransformError, TransformTree, make_transform
 from rs_localizer.offline.replay import imu_first
+from rs_localizer.pipeline.aid import in_camera_axes
 from rs_localizer.pipeline.camera_frames import CameraFrames, Refusal
-from rs_localizer.pipeline.imu_readings import in_camera_axes
 
 READOUT_TIME = 0.03
 CONFIG = NodeConfig(readout_time=READOUT_TIME)
@@ -130,7 +130,7 @@ def fly(
 
     def awaits(item: Item) -> bool:
         frame = item[0] == "/correspondences" and not late
-        return frame and frames.awaits_imu(stamp_ns(item[2]), 1.0)
+        return frame and frames.awaits_readings(stamp_ns(item[2]), 1.0)
 
     for topic, _, message in imu_first(changed(), "/imu", awaits):
         if len(flown.results) == most:
@@ -138,10 +138,10 @@ def fly(
         if topic == "/camera_info":
             frames.calibrate(read_camera_info(message))
         elif topic == "/imu":
-            frames.imu.add(read_imu(message))
+            frames.aid.add(read_imu(message))
         else:
             flown.results.append(frames.localize(message))
-    flown.state = frames.imu.state
+    flown.state = frames.aid.state
     return flown
 
 

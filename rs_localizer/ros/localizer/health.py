@@ -12,8 +12,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rs_localizer.core.reasons import ImuReason, Notice
 from rs_localizer.io.messages import make_header
 from rs_localizer.io.outputs import Localized
+from rs_localizer.pipeline.aid import AidState, in_words
 from rs_localizer.pipeline.camera_frames import DOUBTFUL
-from rs_localizer.pipeline.imu_readings import ImuState, in_words
 from rs_localizer.pipeline.inputs import Role, input_in_words, input_named
 from rs_localizer.pipeline.map_to_odom import Decision, Standing
 from rs_localizer.ros.node.conversion import make_message
@@ -81,7 +81,7 @@ _FEW = 0.5
 _MOST_TILT = math.radians(10.0)
 
 
-def imu_oddity(state: ImuState | None) -> dict[str, str]:
+def imu_oddity(state: AidState | None) -> dict[str, str]:
     """Return reasons why the camera goes on alone, with advice, and what contradicts gravity."""
     if state is None:
         return {}
@@ -111,7 +111,7 @@ def readout_values(seen: MeasuredReadout | None) -> dict[str, str]:
     return {"Readout time seen (ms)": f"{readout:.2f} +- {deviation:.2f}"}
 
 
-def imu_values(state: ImuState | None) -> dict[str, str]:
+def imu_values(state: AidState | None) -> dict[str, str]:
     """Return values by readable names, without what is not known."""
     if state is None:
         return {}

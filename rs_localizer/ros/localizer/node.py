@@ -262,7 +262,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
             self.refusals.add(refusal.reason, refusal.detail)
             return
         self.worker.look()
-        if self._needs_tf and self._frames.imu.frame != self._frames.camera_frame:
+        if self._needs_tf and self._frames.aid.frame != self._frames.camera_frame:
             self._needs_tf = False
             self._broadcaster.tf.listen("the IMU")
 
@@ -321,7 +321,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         oddities = self.refusals.recent(_ODD, WINDOW) | self._broadcaster.fault()
         values: dict[str, str] = {}
         if frames is not None:
-            watch, imu = frames.shutter, frames.imu.state
+            watch, imu = frames.shutter, frames.aid.state
             oddities |= imu_oddity(imu)
             oddities |= {"readout_time": watch.fault} if watch.fault else {}
             values = readout_values(watch.measured) | imu_values(imu)
@@ -343,7 +343,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
 def _patience(frames: FrameLocalizer, message: Any) -> float:
     """Return how long (s) a frame waits for the IMU's readings of its exposure."""
     wait = frames.config.imu.wait
-    return wait if frames.awaits_imu(stamp_ns(message), wait) else 0.0
+    return wait if frames.awaits_readings(stamp_ns(message), wait) else 0.0
 
 
 def described(landmarks: Map) -> str:

@@ -10,15 +10,17 @@ arrival, so that a recording gives the same poses live and offline.
 import math
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.config import ImuUse, NodeConfig
+from rs_localizer.config import Imu, ImuUse, NodeConfig
 from rs_localizer.core.arrays import IntArray
+from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import ImuReason
 from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.estimation.known_rotation import Aid
 from rs_localizer.inertial.buffer import LONGEST_PERIOD_NS, ReadingBuffer, Readings
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.status import InertialSettings, InertialStatus, Unused
@@ -51,7 +53,7 @@ def in_words(unused: Unused) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class ImuState:
+class AidState:
     """State of the IMU, for people."""
 
     frames: int  # since its first reading
@@ -66,6 +68,23 @@ class ImuState:
     # None: imu.gravity is off
     gravity: float | None = None
 
+    def rows(self) -> list[tuple[str, object]]:
+        """Return names and values of a summary."""
+        rows: list[tuple[str, object]] = [
+            ("localized with the IMU", f"{self.used / self.frames:.1%}"),
+            *((f"  without: {reason}", count) for reason, count in self.reasons.items()),
+        ]
+        if self.used and self.status is not None and math.isfinite(self.time_offset):
+            bias = np.linalg.norm(np.degrees(self.status.bias))
+            offset, deviation = 1e3 * self.time_offset, 1e3 * self.status.time_offset_deviation
+            rows += [
+                ("  bias of the gyroscope (deg/s)", f"{bias:.2f}"),
+                ("  time offset of the IMU (ms)", f"{offset:.2f} +- {deviation:.2f}"),
+            ]
+            if self.status.oddity:
+                rows.append(("  said by the camera's rotation:", self.status.oddity))
+        return rows
+
 
 class Moment(NamedTuple):
     """A time, and what readings of that time are for."""
@@ -78,14 +97,15 @@ class Moment(NamedTuple):
 
     def exposure(self) -> tuple[int, int]:
         """Return the times of first and last row by the clock of the IMU, as far as it is known."""
-        status = self.tracker.inertial
+        aid = self.tracker.aid
+        status = None if aid is None else aid.status
         estimated = 0.0 if status is None or math.isnan(status.time_offset) else status.time_offset
         middle_ns = self.time_ns - round(1e9 * (self.config.imu.time_offset + estimated))
         half_ns = round(0.5e9 * self.config.readout_time)
         return middle_ns - half_ns, middle_ns + half_ns
 
 
-class ImuInput:
+class AidInput:
     """Takes readings, tracks frames with theirs, and counts how many could use them.
 
     Args:
@@ -120,7 +140,7 @@ class ImuInput:
         return self._buffer.frame
 
     @property
-    def state(self) -> ImuState | None:
+    def state(self) -> AidState | None:
         """For the diagnostics; None as long as no frame has met an IMU."""
         recently = tuple(self._recently)
         if not recently:
@@ -128,7 +148,7 @@ class ImuInput:
         estimated = math.nan if self._status is None else self._status.time_offset
         reasons = [unused.reason for unused in recently if unused is not None]
         usual = max(reasons, key=reasons.count, default=None)
-        return ImuState(
+        return AidState(
             self._frames,
             self._used,
             recently.count(None) / len(recently),
@@ -142,7 +162,7 @@ class ImuInput:
 
     def awaits(self, frame: Moment, patience: float) -> bool:
         """Return True if missing readings of this exposure may come within so many seconds."""
-        if not self._wanted(frame.config) or frame.tracker.inertial is None:
+        if not self._wanted(frame.config) or frame.tracker.aid is None:
             return False
         missing_ns = self._buffer.lag(frame.exposure()[1] + _AROUND_NS)
         return 0 < missing_ns <= round((patience + _BUNDLE) * 1e9)
@@ -152,7 +172,7 @@ class ImuInput:
 
         None where there are none, or the frame was the last one so long ago that none counts.
         """
-        if not self._wanted(now.config) or now.tracker.inertial is None:
+        if not self._wanted(now.config) or now.tracker.aid is None:
             return None
         since_ns = now.time_ns - round(1e9 * now.config.max_prediction)
         start_ns, _ = now._replace(time_ns=since_ns).exposure()
@@ -166,7 +186,7 @@ class ImuInput:
         config, tracker = frame.config, frame.tracker
         if not self._wanted(config):
             return localized(None)
-        if tracker.inertial is None:
+        if tracker.aid is None:
             unknown = config.readout_time == 0.0
             reason = ImuReason.NO_READOUT_TIME if unknown else ImuReason.NOT_TRACKING
             self._count(config, None, Unused(reason))
@@ -177,7 +197,7 @@ class ImuInput:
             self._count(config, tracker, samples)
         else:
             result = localized(samples)
-            self._count(config, tracker, tracker.inertial.unused)
+            self._count(config, tracker, tracker.aid.status.unused)
             self._compare_gravity(config, samples, result)
         return result
 
@@ -228,7 +248,8 @@ class ImuInput:
         self._frames += 1
         self._used += unused is None
         self._recently.append(unused)
-        self._status = None if tracker is None else tracker.inertial
+        aid = None if tracker is None else tracker.aid
+        self._status = None if aid is None else aid.status
         self._given_offset = config.imu.time_offset
         oddity = "" if self._status is None else self._status.oddity
         self._odd = self._odd + 1 if oddity else 0
@@ -245,10 +266,29 @@ class ImuInput:
             self._notice(unused.reason, f"the IMU is not used: {in_words(unused)}")
 
 
-def inertial_settings(config: NodeConfig) -> InertialSettings | None:
-    """Return the IMU settings of the tracker; None if no IMU is to be used."""
+def without_wait(config: NodeConfig) -> NodeConfig:
+    """Return the settings that results depend on: of an IMU that is not used, nothing."""
+    unused = config.of_cameras or config.imu.use == ImuUse.NONE
+    imu = Imu(use=ImuUse.NONE) if unused else replace(config.imu, wait=0.0)
+    return replace(config, imu=imu)
+
+
+def without_aid(config: NodeConfig) -> NodeConfig:
+    """Return the settings without an IMU."""
+    return replace(config, imu=replace(config.imu, use=ImuUse.NONE))
+
+
+def aid_of(config: NodeConfig, camera: Camera) -> Aid | None:
+    """Return what a tracker knows of the gyroscope; None if no IMU is to be used."""
     if config.imu.use == ImuUse.NONE:
         return None
+    from rs_localizer.inertial.gyro_prior import GyroscopeTrack  # without an IMU nobody needs it
+
+    return GyroscopeTrack(inertial_settings(config), camera.readout_time)
+
+
+def inertial_settings(config: NodeConfig) -> InertialSettings:
+    """Return what is known of the IMU before any frame."""
     return InertialSettings(
         gyroscope_noise=config.imu.gyroscope_noise,
         gyroscope_bias_walk=config.imu.gyroscope_bias_walk,

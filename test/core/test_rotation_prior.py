@@ -1,12 +1,18 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The turn within a frame: against SciPy's splines and its integration of the kinematics."""
+"""A known rotation in a frame: against SciPy's splines and its integration of the kinematics."""
 
 import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
-from rs_localizer.core.gyro_rotation import GyroRotation, gyro_compensated
+from rs_localizer.core.rotation_prior import (
+    NODES,
+    WHOLE,
+    RotationPrior,
+    compensated,
+    parts_of,
+)
 from rs_localizer.core.so3 import hat
 
 TAU = np.linspace(-0.8, 0.8, 33)
@@ -27,19 +33,27 @@ def integrated(rate, tau):
     return found.y[:, -1].reshape(3, 3)
 
 
-def test_rotations_are_the_integral_of_the_rates():
-    turn = GyroRotation.of(TAU, shaking(TAU))
+def known():
+    """The rotation with these rates, by its turns at the nodes."""
     spline = CubicSpline(TAU, shaking(TAU), bc_type="natural")
-    for tau, rotation in zip(ROWS, turn.at_rows(ROWS)[0], strict=True):
-        np.testing.assert_allclose(rotation, integrated(spline, tau), atol=1e-7)
+    turns = np.array([integrated(spline, tau) for tau in NODES])
+    return RotationPrior(*parts_of(turns), np.zeros((WHOLE, WHOLE)), False), spline
+
+
+def test_rotations_are_the_integral_of_the_rates():
+    rotation, spline = known()
+    turns, rates = rotation.at_rows(ROWS)
+    for tau, turn in zip(ROWS, turns, strict=True):
+        np.testing.assert_allclose(turn, integrated(spline, tau), atol=3e-5)
+    np.testing.assert_allclose(rates, spline(ROWS), atol=1e-3)
 
 
 def test_compensated_bearings_are_those_of_the_middle_row():
     rng = np.random.default_rng(1)
     rays, tau = rng.uniform(-0.6, 0.6, (20, 2)), rng.uniform(-0.5, 0.5, 20)
-    turn = GyroRotation.of(TAU, shaking(TAU))
+    turn, _ = known()
     by_ray = np.broadcast_to(400.0 * np.eye(2), (20, 2, 2)).copy()
-    found, _ = gyro_compensated(rays, tau, by_ray, np.zeros(2), turn)
+    found, _ = compensated(rays, tau, by_ray, np.zeros(2), turn)
     bearings = np.column_stack([rays, np.ones(20)])
     expected = np.einsum("nji,nj->ni", turn.at_rows(tau)[0], bearings)
     np.testing.assert_allclose(found, expected[:, :2] / expected[:, 2:], atol=1e-14)
@@ -47,17 +61,17 @@ def test_compensated_bearings_are_those_of_the_middle_row():
 
 def test_derivatives_of_compensated_bearings_by_differences():
     """Noise of the pixel moves the bearing and, with the row time, the turn."""
-    turn, gradient, step = GyroRotation.of(TAU, shaking(TAU)), np.array([3e-4, 2e-3]), 1e-4
+    (turn, _), gradient, step = known(), np.array([3e-4, 2e-3]), 1e-4
     ray, tau, focal = np.array([0.2, -0.3]), 0.21, 400.0
 
     def steady(pixel):  # where a pixel's own row time puts its bearing
         later = tau + gradient @ (pixel - focal * ray)
-        return gyro_compensated(
+        return compensated(
             pixel[None] / focal, np.array([later]), np.zeros((1, 2, 2)), gradient, turn
         )[0][0]
 
     steps = step * np.eye(2)
     changes = [steady(focal * ray + one) - steady(focal * ray - one) for one in steps]
     by_pixel = np.array(changes).T / (2.0 * step)
-    _, found = gyro_compensated(ray[None], np.array([tau]), focal * np.eye(2)[None], gradient, turn)
+    _, found = compensated(ray[None], np.array([tau]), focal * np.eye(2)[None], gradient, turn)
     np.testing.assert_allclose(found[0] @ by_pixel, np.eye(2), atol=1e-6)

@@ -1,0 +1,166 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The in-frame turn beside a rotation that is known (:mod:`rs_localizer.core.rotation_prior`).
+
+Its coefficients ``k`` (:mod:`.linear_fit`) go with the motion ``x`` beside that rotation:
+
+    k = A (x - x_0) + rest,     rest ~ N(0, Q)
+
+With ``A x`` in the columns of the motion the prior of the rest is one of :class:`.TurnPrior`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.rotation_prior import ROTATION, WHOLE, RotationPrior
+from rs_localizer.core.shake import COMBINATIONS
+from rs_localizer.core.shutter import Motion
+from rs_localizer.core.state import PARAMETERS
+from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.linear_fit import (
+    BLOCKS,
+    MIDDLE,
+    TURNS,
+    Linear,
+    LinearFit,
+    TurnPrior,
+    moved,
+)
+from rs_localizer.estimation.prior import Prior
+from rs_localizer.estimation.window import MotionSample
+
+# Sizes of vibration that the other knowledge misses, over ordinary ones; none at first.
+_MISSED = (0.0, 1.0, 30.0)
+# Probability that it misses none.
+_COMPLETE = 0.99
+# Size of vibration, over an ordinary one, that is rounding.
+_LEAST = 1e-4
+_IN_TURNS = np.kron(np.linalg.pinv(COMBINATIONS), np.eye(3))
+
+
+class CoupledTurn(NamedTuple):
+    """Prior of the in-frame turn beside a rotation that is known, given the motion beside it."""
+
+    by_motion: Array  # (54,18)
+    rest: TurnPrior
+
+
+def coupled_turn(rotation: RotationPrior, predicted: bool) -> CoupledTurn:
+    """Return the prior of the in-frame turn.
+
+    Args:
+        predicted: whether the motion is found near the one that is predicted.
+    """
+    place = np.arange(PARAMETERS) if predicted and rotation.predicted else ROTATION[:6]
+    turn, own = BLOCKS["turn"], rotation.covariance[np.ix_(place, place)]
+    across = rotation.covariance[turn][:, place]
+    by_motion, scale = np.zeros((TURNS, PARAMETERS)), np.sqrt(own.diagonal())
+    by_scaled = np.linalg.solve(own / np.outer(scale, scale), (across / scale).T).T
+    by_motion[:, place] = by_scaled / scale
+    rest = rotation.covariance[turn, turn] - by_motion[:, place] @ across.T
+    sizes, axes = np.linalg.eigh(0.5 * (rest + rest.T))
+    sizes = np.maximum(sizes, _LEAST**2)
+    each = [sizes + missed**2 for missed in _MISSED]
+    informations = np.array([(axes / one) @ axes.T for one in each])
+    odds = np.full((len(each), 1), math.log((1.0 - _COMPLETE) / (len(each) - 1)))
+    odds[0] = math.log(_COMPLETE)
+    volumes = np.array([-0.5 * np.log(one).sum() for one in each])
+    return CoupledTurn(by_motion, TurnPrior(informations, volumes, np.ones(1), odds))
+
+
+def whole_covariance(covariance: Array) -> Array:
+    """Return the covariance (102,102) of an estimate by one (72,72) of a motion without its
+    vibration and an in-frame turn.
+    """
+    functions = np.kron(COMBINATIONS, np.eye(3))
+    by_both = np.zeros((PARAMETERS + len(functions), WHOLE))
+    by_both[:PARAMETERS] = np.hstack([np.eye(PARAMETERS), MIDDLE])
+    by_both[PARAMETERS:, PARAMETERS:] = functions
+    whole: Array = by_both @ covariance @ by_both.T
+    return whole
+
+
+def with_turn(covariance: Array, rotation: RotationPrior) -> Array:
+    """Return the covariance (102,102) of a motion (18,18) and what the rotation beside it is."""
+    functions, turn = np.kron(COMBINATIONS, np.eye(3)), BLOCKS["turn"]
+    joint = np.zeros((PARAMETERS + len(functions),) * 2)
+    joint[:PARAMETERS, :PARAMETERS] = covariance
+    joint[PARAMETERS:, PARAMETERS:] = functions @ rotation.covariance[turn, turn] @ functions.T
+    return joint
+
+
+def uncoupled(linear: Linear, by_motion: Array, offset: Array) -> Linear:
+    """Return the system of the motion and the rest of the turn, where the motion is off (18,)."""
+    linear = moved(linear, np.concatenate([np.zeros(PARAMETERS), by_motion @ offset]))
+    both = _both(by_motion)
+    return linear._replace(
+        own=both.T @ linear.own @ both, along=both.T @ linear.along, beside=linear.beside @ both
+    )
+
+
+def coupled(found: LinearFit, by_motion: Array, offset: Array) -> LinearFit:
+    """Return the fit of motion and turn by one of the motion and the rest of the turn."""
+    both = _both(by_motion)
+    step = both @ found.step
+    step[PARAMETERS:] += by_motion @ offset
+    return found._replace(step=step, covariance=both @ found.covariance @ both.T)
+
+
+def _both(by_motion: Array) -> Array:
+    both = np.eye(WHOLE)
+    both[PARAMETERS:, :PARAMETERS] = by_motion
+    return both
+
+
+def turn_of(estimate: Estimate) -> Array:
+    """Return the in-frame turn (54,) of an estimate with one."""
+    turn: Array = _IN_TURNS @ estimate.shake.ravel()
+    return turn
+
+
+class LastFrame(NamedTuple):
+    """The last frame with a pose, for a prediction."""
+
+    middle_ns: int
+    motion: Motion
+    covariance: Array  # (18,18)
+    added: Array  # (18,18) that the prediction gets, but for the rotation
+    fading: float  # of accelerations, in readouts
+
+
+class Foretold(Protocol):
+    """Knowledge that an aid has of a frame before its points."""
+
+    @property
+    def rotation(self) -> RotationPrior: ...
+    @property
+    def prior(self) -> Prior | None:
+        """Of the motion beside the rotation; None: nothing follows from before."""
+
+    def of(self, last: Estimate) -> Estimate:
+        """Return the estimate that it makes of the last frame's."""
+
+
+class Aid(Protocol):
+    """Who knows from readings how a camera turns, and learns from its frames.
+
+    The frames ask :meth:`foresee` before each one, and tell of it by :meth:`agrees`.
+    """
+
+    def foresee(self, readings: Any, middle_ns: int, last: LastFrame | None) -> Foretold | None: ...
+    def agrees(self, foretold: Any, found: Estimate, told: MotionSample) -> bool: ...
+    def ahead(self, readings: Any, middle_ns: int, last: LastFrame | None) -> Foretold | None: ...
+    def changed(self, readings: Any, seconds: float) -> float: ...
+    def last_ns(self, readings: Any) -> int: ...
+    def forget_delay(self) -> None: ...
+    def reset(self) -> None: ...
+    def snapshot(self) -> Aid: ...
+    @property
+    def agreed(self) -> bool: ...
+    @property
+    def status(self) -> Any: ...
