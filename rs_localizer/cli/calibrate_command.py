@@ -16,7 +16,7 @@ from typing import Any
 from rs_localizer.cli import WORKING, image_input, refuse_existing, write_all
 from rs_localizer.cli.image_input import ImageOptions, given_lens
 from rs_localizer.cli.marker_map import TargetOptions, find_map
-from rs_localizer.cli.options import UsageError, argument, option
+from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.cli.rig_input import cameras_of, mounting_lines
 from rs_localizer.cli.settings_args import given_settings, given_topics, remapped
 from rs_localizer.cli.typed import typed
@@ -66,7 +66,7 @@ Writers = dict[Path, Callable[[Path], object]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(TargetOptions, ImageOptions):
+class Options(TargetOptions, ImageOptions, ResultOptions):
     recordings: list[Path] = argument(
         "a bag of correspondences or keypoints; or, with --map or --board, images: a video, a "
         "folder, a bag; several with --rig", "RECORDING",
@@ -89,7 +89,6 @@ class Options(TargetOptions, ImageOptions):
     camera_info: Path | None = option(
         "also the lens alone, for ROS drivers (of a rig, FILE_NAME for each)", "FILE"
     )
-    overwrite: bool = option("replace an earlier result", default=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -22,7 +21,7 @@ from rs_localizer.cli.image_input import (
     shutter_values,
 )
 from rs_localizer.cli.marker_map import TargetOptions, find_map
-from rs_localizer.cli.options import UsageError, argument, option
+from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.cli.rig_input import cameras_of
 from rs_localizer.cli.typed import typed
 from rs_localizer.config import DetectorConfig, FeatureConfig, FeatureKind
@@ -48,7 +47,7 @@ _LEAST_KEYPOINTS = settings(FeatureConfig)["max_keypoints"].minimum or 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(TargetOptions, ImageOptions):
+class Options(TargetOptions, ImageOptions, ResultOptions):
     recording: Path = argument(
         "a video (also a stream of JPEG images, .mjpeg), a rosbag2 or ROS 1 bag with raw or "
         "compressed images, or a folder of .jpg or .png files", "VIDEO|BAG|FOLDER",
@@ -59,10 +58,9 @@ class Options(TargetOptions, ImageOptions):
     )
     max_keypoints: int | None = option(
         "of an image, the best of all its parts (default: "
-        f"{FeatureConfig().max_keypoints})", "N", limits=(_LEAST_KEYPOINTS, math.inf),
+        f"{FeatureConfig().max_keypoints})", "N", least=_LEAST_KEYPOINTS,
     )  # fmt: skip
     out: Path = option("bag directory to create", "DIR", required=True)
-    overwrite: bool = option("replace an earlier result", default=False)
     with_images: bool = option("copy compressed images, too", default=False, flag="--images")
 
 

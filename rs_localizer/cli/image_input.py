@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -60,7 +59,7 @@ class ImageOptions(LensOptions):
 
     rate: float | None = option(
         "images per second, instead of the presentation times of a video, or for files whose names "
-        "are not times in ns", "HZ", limits=(0.0, math.inf), above=True,
+        "are not times in ns", "HZ", above=0.0,
     )  # fmt: skip
 
 

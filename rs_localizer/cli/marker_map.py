@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,7 +31,7 @@ class TargetOptions:
     map: Path | None = option("marker map; also that of keypoints, where they are read", "FILE")
     board: str | None = option("instead: inner corners along a row x rows of a chessboard", "6x4")
     square: float | None = option(
-        "side of its squares in metres", "M", limits=(0.0, math.inf), above=True,
+        "side of its squares in metres", "M", above=0.0
     )  # fmt: skip
 
 

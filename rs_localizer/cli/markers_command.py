@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,9 +44,9 @@ class Options(ResultOptions):
     size: float | None = option(
         f"side of a marker or of a board's squares (default: what fills the page, but at least "
         f"{_SIZE} or {_SQUARE})", "M",
-        limits=(0.0, math.inf), above=True,
+        above=0.0,
     )  # fmt: skip
-    first_id: int = option("id of the first marker", "N", 0, limits=(0, math.inf))
+    first_id: int = option("id of the first marker", "N", 0, least=0.0)
     page: str = option("of paper", default="a4", choices=sorted(PAGES))
     standing: bool = option(
         "map frame with z up and y into the wall; otherwise x is to the right, y up and z towards "

@@ -52,8 +52,9 @@ def option(
     *,
     flag: str = "",
     choices: Sequence[str] = (),
-    limits: tuple[float, float] = (-math.inf, math.inf),
-    above: bool = False,
+    least: float = -math.inf,
+    most: float = math.inf,
+    above: float = -math.inf,
     required: bool = False,
 ) -> Any:
     """Declare a field that is given by ``--its-name``.
@@ -64,13 +65,14 @@ def option(
         default: ``list`` for one that may be repeated; of a switch, False.
         flag: another name, such as ``-p``, or several.
         choices: of a text.
-        limits: least and largest number.
-        above: the least itself is refused.
+        least: of a number.
+        most: likewise.
+        above: what a number is more than.
         required: there is no default.
     """
     about: dict[str, Any] = {"help": help, "metavar": metavar, "flag": flag}
     about |= {"choices": tuple(choices)}
-    about |= {"limits": limits, "above": above, "required": required, "positional": False}
+    about |= {"limits": (least, most, above), "required": required, "positional": False}
     if default is list:
         return field(default_factory=list, metadata=about)
     return field(default=default, metadata=about)
@@ -114,7 +116,7 @@ class FleetOptions:
     workers: int | None = option(
         "recordings at a time, each in a process of its own (pip install 'rs_localizer[fleet]')",
         "N",
-        limits=(1, math.inf),
+        least=1,
     )
     scheduler: str | None = option(
         "instead: the workers of a Dask scheduler, such as tcp://host:8786, which see these files "
@@ -173,9 +175,9 @@ def _add(group: argparse._ActionsContainer, kind: type[Any], item: Any) -> None:
         words["action"] = "store_true"
     else:
         words["metavar"] = about["metavar"] or None
-        limits, above = about.get("limits", (-math.inf, math.inf)), about.get("above", False)
+        limits = about.get("limits", ())
         words["type"] = {
-            float: number(*limits, above=above), int: integer(*limits), Path: path, str: str
+            float: number(*limits), int: integer(*limits), Path: path, str: str
         }.get(one, one)  # fmt: skip
         if about.get("choices"):
             words["choices"] = about["choices"]
@@ -238,18 +240,12 @@ def path(text: str) -> Path:
 
 
 def number(
-    minimum: float = -math.inf,
-    maximum: float = math.inf,
-    *,
-    above: bool = False,
+    least: float = -math.inf,
+    most: float = math.inf,
+    above: float = -math.inf,
     kind: type[float] | type[int] = float,
 ) -> Callable[[str], float]:
-    """Return a parser of finite numbers in a range, for ``add_argument(type=...)``.
-
-    Args:
-        above: the minimum itself is refused.
-        kind: int: a whole number.
-    """
+    """Return a parser of finite numbers in a range, for ``add_argument(type=...)``."""
 
     def parse(text: str) -> float:
         try:
@@ -259,10 +255,12 @@ def number(
         if not math.isfinite(value):
             what = "a whole number" if kind is int else "a number"
             raise argparse.ArgumentTypeError(f"must be {what}, got {text!r}")
-        if not minimum <= value <= maximum or (above and value == minimum):
-            wanted = f"must be more than {minimum:g}" if above else f"must be {minimum:g} or more"
-            if math.isfinite(maximum):
-                wanted = f"must lie between {minimum:g} and {maximum:g}"
+        if not least <= value <= most or value <= above:
+            wanted = f"must be more than {above:g}"
+            if math.isfinite(least):
+                wanted = f"must be {least:g} or more"
+            if math.isfinite(most):
+                wanted = f"must lie between {least:g} and {most:g}"
             raise argparse.ArgumentTypeError(f"{wanted}, got {text}")
         return value
 

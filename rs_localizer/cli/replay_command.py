@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import functools
 import importlib
-import math
 import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from rs_localizer.cli import WORKING, earlier_result
 from rs_localizer.cli.image_input import ImageOptions
-from rs_localizer.cli.options import FleetOptions, UsageError, argument, option
+from rs_localizer.cli.options import FleetOptions, ResultOptions, UsageError, argument, option
 from rs_localizer.cli.settings_args import given_topics, given_values
 from rs_localizer.io.atomic_files import atomic_directory, check_writable
 from rs_localizer.io.bags import is_bag, open_bag
@@ -52,7 +51,7 @@ TABLE = "frames.parquet"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(ImageOptions, FleetOptions):
+class Options(ImageOptions, FleetOptions, ResultOptions):
     recordings: list[Path] = argument(
         "rosbag2 (MCAP, sqlite3) or ROS 1 bag; with --map, a video, a folder or a bag of images",
         "RECORDING",
@@ -61,7 +60,6 @@ class Options(ImageOptions, FleetOptions):
         f"directory to create, for {POSES} (TUM), {TWISTS} and the bag {RESULT}; of many, one for "
         "all (default: RECORDING_replay)", "DIR",
     )  # fmt: skip
-    overwrite: bool = option("replace an earlier result", default=False)
     map: Path | None = option(
         "the map of the keypoints; of images, also markers or the result of map build, which "
         "brings the lens and the shutter", "FILE",
@@ -73,7 +71,7 @@ class Options(ImageOptions, FleetOptions):
     )
     pose_rate: float | None = option(
         "with --smooth: poses of the motion per second (default: one for each image)",
-        "HZ", limits=(0.0, math.inf), above=True,
+        "HZ", above=0.0,
     )  # fmt: skip
     parquet: Path | None = option(
         "also write one table of all recordings, a row a frame: poses, twists, covariances, why "

@@ -77,7 +77,6 @@ _START_NS = 1_000_000_000  # a time of 0 means "none" to ROS
 BUNDLED = "tum_vi_room5"  # stands for the bundled trajectory
 _READOUT_TIME = 0.03  # s, of a webcam
 _POINTS, _PICTURES = FrameSettings(), ImageSettings()
-_POSITIVE = (0.0, math.inf)
 # Options of the one kind of recording that mean nothing to the other.
 _OF_POINTS, _OF_IMAGES = ("points", "outliers", "keypoints"), ("walls", "exposure")
 _OF_A_CAMERA = {"camera", "readout_time", "scan_direction", "imu", "imu_offset"}
@@ -100,14 +99,14 @@ class MotionOptions:
     linear_velocity: tuple[float, float, float] | None = option(
         "m/s along the camera axes at the start; without any motion given: 0.3 0 0", "X Y Z"
     )
-    start: float = option("seconds to skip", "S", 0.0, limits=_POSITIVE)
+    start: float = option("seconds to skip", "S", 0.0, least=0.0)
     duration: float | None = option(
         f"seconds (default: the whole trajectory; {_DURATION:g} at constant velocity)", "S",
-        limits=_POSITIVE, above=True,
+        above=0.0,
     )  # fmt: skip
     vibration: list[tuple[float, float]] = option(
         "add vibration by DEG about any axis; may be repeated", "DEG HZ",
-        list, limits=(0.0, math.inf),
+        list, least=0.0,
     )  # fmt: skip
 
 
@@ -121,7 +120,7 @@ class CameraOptions:
     )  # fmt: skip
     readout_time: float | None = option(
         f"from the first row to the last (default: that of the camera, or {_READOUT_TIME:g})", "S",
-        limits=(0.0, settings()["readout_time"].maximum or 0.0),
+        least=0.0, most=settings()["readout_time"].maximum or 0.0,
     )  # fmt: skip
     scan_direction: str | None = option(
         "of the shutter (default: that of the camera, or top_to_bottom)",
@@ -138,14 +137,12 @@ class CameraOptions:
 @dataclass(frozen=True, kw_only=True)
 class Options(MotionOptions, CameraOptions, ResultOptions):
     out: Path = argument("bag directory to create", "OUT")
-    points: int = option(
-        "points of a frame, if it sees that many", "N", _POINTS.points, limits=(1, math.inf)
-    )
+    points: int = option("points of a frame, if it sees that many", "N", _POINTS.points, least=1)
     noise: float | None = option(
         f"deviation: px of each raw coordinate (default: {_POINTS.noise:g}); of images, grey "
-        f"levels of 255 ({_PICTURES.noise:g})", "SIGMA", limits=_POSITIVE,
+        f"levels of 255 ({_PICTURES.noise:g})", "SIGMA", least=0.0,
     )  # fmt: skip
-    outliers: float = option("of the points", "SHARE", _POINTS.outliers, limits=(0.0, 1.0))
+    outliers: float = option("of the points", "SHARE", _POINTS.outliers, least=0.0, most=1.0)
     keypoints: bool = option(
         "pixels with binary descriptors, and their map, instead of matches", default=False
     )
@@ -155,10 +152,8 @@ class Options(MotionOptions, CameraOptions, ResultOptions):
         "pictures; marked_room: with a few markers on its walls",
         default=next(iter(SCENES)), choices=list(SCENES),
     )  # fmt: skip
-    exposure: float = option(
-        "of a row: motion blur of images", "S", _PICTURES.exposure, limits=_POSITIVE
-    )
-    seed: int = option("of all random numbers", "N", 0, limits=(0, math.inf))
+    exposure: float = option("of a row: motion blur of images", "S", _PICTURES.exposure, least=0.0)
+    seed: int = option("of all random numbers", "N", 0, least=0)
 
 
 def camera_of(args: Options) -> Camera:

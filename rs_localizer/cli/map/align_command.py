@@ -4,13 +4,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, refuse_existing, write_all
 from rs_localizer.cli.map import info_command
-from rs_localizer.cli.options import UsageError, argument, option
+from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.io.maps.files import SUFFIX, write_npz
 from rs_localizer.markers.map_files import write_marker_map
 
@@ -25,10 +24,9 @@ _OUTPUTS = (SUFFIX, ".yaml", ".yml")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(info_command.Options):
+class Options(info_command.Options, ResultOptions):
     out: Path = argument(f"ends in {', '.join(_OUTPUTS)}", "OUT")
-    overwrite: bool = option("replace OUT", default=False)
-    scale: float | None = option("factor", "FACTOR", limits=(0.0, math.inf), above=True)
+    scale: float | None = option("factor", "FACTOR", above=0.0)
     distance: tuple[float, float, float] | None = option(
         "instead: two ids (of landmarks, or of markers, whose middles count), and how far apart "
         "they are", "ID ID M",

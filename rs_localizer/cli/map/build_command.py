@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ from rs_localizer.cli.image_input import (
     print_times,
     shutter_values,
 )
-from rs_localizer.cli.options import UsageError, argument, number, option
+from rs_localizer.cli.options import ResultOptions, UsageError, argument, number, option
 from rs_localizer.cli.typed import typed
 from rs_localizer.config import FeatureConfig
 
@@ -76,10 +75,9 @@ _IMAGES_PER_SECOND = 15.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(ImageOptions):
+class Options(ImageOptions, ResultOptions):
     recording: Path = argument("images of one camera, as for detect", "VIDEO|BAG|FOLDER")
     out: Path = option("to create", "DIR", required=True)
-    overwrite: bool = option("replace an earlier result", default=False)
     markers: Path | None = option("marker map; some of it is in the images", "FILE")
     point: list[tuple[str, str, str, str]] = option(
         "a point in the first image at or after SECONDS from the start, by its raw pixel; each "
@@ -89,8 +87,7 @@ class Options(ImageOptions):
         "between two of these points", "NAME NAME METRES", list
     )
     images_per_second: float = option(
-        "of a video that are used, at most", "N", _IMAGES_PER_SECOND, limits=(0.0, math.inf),
-        above=True,
+        "of a video that are used, at most", "N", _IMAGES_PER_SECOND, above=0.0,
     )  # fmt: skip
 
 

@@ -27,6 +27,8 @@ Figures = dict[str, Any]
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
+    """the map."""
+
     file: Path = argument(
         "landmarks: a .npz file or a folder of COLMAP; markers: a .yaml or .json file of "
         f"{', '.join(FORMATS)}", "FILE",

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +13,7 @@ from pathlib import Path
 from rs_localizer.cli import WORKING, earlier_result, refuse_existing, write_all
 from rs_localizer.cli.image_input import LensOptions
 from rs_localizer.cli.map import check_readout
-from rs_localizer.cli.options import UsageError, argument, option
+from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.cli.rig_input import MapCamera, map_cameras, mounting_lines
 from rs_localizer.cli.settings_args import given_settings, given_topics, given_values
 from rs_localizer.io.maps.files import SUFFIX, read_map_file, write_npz
@@ -49,11 +48,10 @@ _step = partial(print, "adjusted:", flush=True)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(LensOptions):
+class Options(LensOptions, ResultOptions):
     recordings: list[Path] = argument("a bag of correspondences or keypoints", "RECORDING", list)
     map: Path | None = option("the map (default: the points of the recording)", "MAP")
     out: Path | None = option(f"ends in {SUFFIX}", "OUT")
-    overwrite: bool = option("replace OUT", default=False)
     intrinsics: bool = option("adjust the lens as well", default=False)
     hold: list[int] = option(
         "landmarks of known place, three or more: they hold frame and size of the map (default: "
@@ -65,7 +63,7 @@ class Options(LensOptions):
     )  # fmt: skip
     rate: float | None = option(
         "with --colmap: images per second of the numbers in the images' names, which else are "
-        "times in ns", "HZ", limits=(0.0, math.inf), above=True,
+        "times in ns", "HZ", above=0.0,
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from rs_localizer.cli import WORKING, refuse_existing, write_all
 from rs_localizer.cli.image_input import ImageOptions, opened, print_left_out, print_times
 from rs_localizer.cli.map import check_readout
-from rs_localizer.cli.options import UsageError, argument, option
+from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.cli.rig_input import MapCamera, map_cameras, mounting_lines
 from rs_localizer.cli.settings_args import given_settings
 from rs_localizer.markers.families import FAMILIES, Family, family
@@ -34,7 +34,7 @@ _LISTED = 12
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(ImageOptions):
+class Options(ImageOptions, ResultOptions):
     recordings: list[Path] = argument(
         "a video, a folder of images, or a bag; several: of cameras on one body, named as their "
         "files", "RECORDING",
@@ -51,7 +51,6 @@ class Options(ImageOptions):
         "group)", "ID",
     )  # fmt: skip
     out: Path = option("map to write", "WALL.yaml", required=True)
-    overwrite: bool = option("replace WALL.yaml", default=False)
 
 
 def run(args: Options) -> None:
