@@ -97,7 +97,7 @@ class _Input:
 
     images: list[ImagePoints]
     camera: Camera
-    new_lens: bool = False  # it is a first guess of this command
+    find_lens: bool  # it is to be found, or a first guess of this command
     imu: ImuRecording | None = None
     map: MarkerMap | None = None  # of images
     own_stamps: bool = True
@@ -108,33 +108,26 @@ def run(options: Options) -> Mapping[str, object]:
         raise UsageError(f"--out must end in .yaml, got {options.out}")
     if options.camera_info is not None and options.out is None:
         raise UsageError("--camera-info goes with --out")
-    args = replace(options, recording=options.recordings[0])
-    if args.rig:
-        return _calibrate_rig(args)
-    if len(args.recordings) > 1:
+    if options.rig:
+        return _calibrate_rig(options)
+    if len(options.recordings) > 1:
         raise UsageError("several recordings are those of a --rig")
-    return _calibrate_one(args)
+    return _calibrate_one(replace(options, recording=options.recordings[0]))
 
 
 def _calibrate_one(args: Options) -> Figures:
     """Calibrate with one recording, and say what was found."""
     if args.out is not None:
         of_images = args.map is not None or args.board is not None
-        maps = [_beside(args, _MAP)] if of_images else []
+        maps = [_beside(args.out, _MAP)] if of_images else []
         refuse_existing(args, args.out, *maps, *_lens_files(args).values())
     config = given_settings(args)
     source = _read(args, config)
-    intrinsics = args.intrinsics or source.new_lens
     camera = replace(source.camera, scan_direction=config.scan_direction)
     found = _calibrated(args, source, camera, config)
     refusal = verdict.refusal(found)
     if args.out is not None and not verdict.lens_refusal(found):
-        written = _write(args, found, source.map, intrinsics, config, refusal)
-        if refusal and written:
-            refusal += (
-                f"; written to {args.out} and beside it: lens, map; not written: readout time and "
-                "scan direction, which stay unknown: no twists"
-            )
+        refusal = _write(args, args.out, found, source, config, refusal)
     if refusal:
         raise ValueError(refusal)
     return _figures(found)
@@ -151,14 +144,8 @@ def _figures(found: CameraCalibration) -> Figures:
     }
 
 
-def _out(args: Options) -> Path:
-    assert args.out is not None  # else nothing is written
-    return args.out
-
-
-def _beside(args: Options, name: str) -> Path:
+def _beside(out: Path, name: str) -> Path:
     """Return the path of a file beside ``OUT.yaml``, as ``OUT_map.yaml``."""
-    out = _out(args)
     return out.with_name(f"{out.stem}_{name}")
 
 
@@ -174,19 +161,18 @@ def _calibrated(
     args: Options, source: _Input, camera: Camera, config: NodeConfig
 ) -> CameraCalibration:
     """Calibrate a camera by its images and print the result."""
-    intrinsics = args.intrinsics or source.new_lens
     shown = covered(camera.size, (image.pixels for image in source.images))
     print(f"all images together show the map in {shown:.0%} of the image")
     gyro = "" if source.imu is None else ", the same with the gyroscope"
     print(f"steps: a pose for each image, one motion through them{gyro}, and parts of it")
     with tqdm(total=len(source.images), unit="image", desc="localize", disable=None) as bar:
         found = calibrate(
-            camera, source.images, intrinsics=intrinsics, imu=source.imu,
+            camera, source.images, intrinsics=source.find_lens, imu=source.imu,
             own_stamps=source.own_stamps, done=bar.update,
         )  # fmt: skip
     print("\n".join(verdict.table(found, args.rate)))
     image_input.print_telemetry(args, verdict.readout_time(found))
-    if intrinsics:
+    if source.find_lens:
         print("\n".join(verdict.of_lens(found)))
     if source.imu is not None:
         print("\n".join(verdict.of_imu(found, source.imu, config.stamp_offset)))
@@ -198,7 +184,7 @@ def _read(args: Options, config: NodeConfig) -> _Input:
     if not path.exists():
         raise ValueError(f"{path} does not exist")
     of_bag = is_bag(path)
-    imu = None if not args.imu else (_imu_of_bag if of_bag else _imu_of_video)(args, path)
+    imu = _imu(args, path) if args.imu else None
     if of_bag and IMAGE not in remapped(args):
         with open_bag(path) as bag:
             if has_frames(bag):
@@ -211,14 +197,13 @@ def _read(args: Options, config: NodeConfig) -> _Input:
     return replace(found, own_stamps=of_bag or (path.is_dir() and args.rate is None), imu=imu)
 
 
-def _imu_of_bag(args: Options, path: Path) -> ImuRecording:
-    with open_bag(path) as bag:
-        topics = remapped(args)
-        frame = optical_frame(bag, topics.get(CAMERA_INFO))
-        return read_imu_recording(bag, topics.get(IMU), frame)
-
-
-def _imu_of_video(args: Options, path: Path) -> ImuRecording:
+def _imu(args: Options, path: Path) -> ImuRecording:
+    """Return the readings of the IMU of a bag or a video."""
+    if is_bag(path):
+        with open_bag(path) as bag:
+            topics = remapped(args)
+            frame = optical_frame(bag, topics.get(CAMERA_INFO))
+            return read_imu_recording(bag, topics.get(IMU), frame)
     telemetry = image_input.telemetry_of(path)
     if args.remaps or telemetry is None or args.rate is not None:
         raise UsageError(
@@ -237,59 +222,54 @@ def _correspondences(args: Options, bag: BagReader, config: NodeConfig) -> _Inpu
     recorded = read_recording(bag, topics, landmarks)
     camera = given_lens(args) or recorded.calibration.camera(0.0, config.scan_direction)
     frames = [(cloud.points, cloud.pixels, ids_of(cloud)) for cloud in recorded.clouds]
-    if mistake := mistake_of(Localizer(camera, config), frames):
-        print(f"warning: {mistake}", file=sys.stderr)
+    _warn(mistake_of(Localizer(camera, config), frames))
     images = [ImagePoints(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in recorded.clouds]
-    return _Input(images, camera)
+    return _Input(images, camera, args.intrinsics)
+
+
+def _warn(*faults: str | None) -> None:
+    for fault in filter(None, faults):
+        print(f"warning: {fault}", file=sys.stderr)
 
 
 def _detected(args: Options, shots: Iterator[Shot | Carried]) -> _Input:
     marker_map = find_map(args)
     detector = FrameDetector(DetectorConfig(), lambda name, text: None, marker_map)
     sizes = BoardSizes(marker_map)
-    images: list[ImagePoints] = []
-    frames = []
+    images, frames, refused = list[ImagePoints](), [], dict[str, str]()
     camera: Camera | None = None
     size = (0, 0)
-    refused = dict[str, str]()
     seen = seen_by(shots, NodeConfig().scan_direction, refused)
     for image, own in tqdm(seen, unit="image", desc="detect", disable=None):
         camera, size = camera or own, image.pixels.shape[::-1]
         found = detector.detect(image).detections
         sizes.count_board(image.pixels, len(found.points) > 0)
         images.append(ImagePoints(image.stamp_ns, found.points, found.pixels))
-        frames.append((found.points, found.pixels, found.ids))
-    shown = sum(len(image.points) > 0 for image in images)
-    print(f"{shown} of {len(images)} images show the map")
-    image_input.print_left_out(refused, {})
-    for fault in (sizes.fault(), detector.mistake):
-        if fault:
-            print(f"warning: {fault}", file=sys.stderr)
-    new_lens = camera is None
-    camera = first_lens(size, in_order(images)) if camera is None else camera
-    shows = [frame for frame in frames if len(frame[0])]
-    if not detector.mistake and (mistake := mistake_of(Localizer(camera), shows)):
-        print(f"warning: {mistake}", file=sys.stderr)
-    return _Input(images, camera, new_lens, map=marker_map)
+        if len(found.points):
+            frames.append((found.points, found.pixels, found.ids))
+    print(f"{len(frames)} of {len(images)} images show the map")
+    image_input.print_left_out(refused)
+    _warn(sizes.fault(), detector.mistake)
+    find_lens = args.intrinsics or camera is None
+    camera = camera or first_lens(size, in_order(images))
+    if not detector.mistake:
+        _warn(mistake_of(Localizer(camera), frames))
+    return _Input(images, camera, find_lens, map=marker_map)
 
 
 def _write(
-    args: Options,
-    found: CameraCalibration,
-    marker_map: MarkerMap | None,
-    intrinsics: bool,
-    config: NodeConfig,
+    args: Options, out: Path, found: CameraCalibration, source: _Input, config: NodeConfig,
     refused: str,
-) -> bool:
+) -> str:  # fmt: skip
     """Write FILE.yaml, beside it the map as it was found, and print what comes next.
 
     Args:
         refused: why the shutter is not known, then it is left out; or ''.
 
     Returns:
-        Whether there was anything to write.
+        ``refused``, with what was written in spite of it.
     """
-    shape = args.map
+    shape, marker_map = args.map, source.map
     values: dict[str, Any] = {"scan_direction": config.scan_direction}
     if not refused:
         values = {
@@ -307,19 +287,34 @@ def _write(
             places = verdict.moved(found, marker_map.points)
             marker_map = marker_map.with_points(places, found.shape_deviation)
         if verdict.shape_is_free(found) or shape is None:
-            shape = _beside(args, _MAP)
+            shape = _beside(out, _MAP)
             writers[shape] = partial(write_marker_map, marker_map=marker_map)
-    if refused and not writers and not intrinsics:
-        return False
+    if refused and not writers and not source.find_lens:
+        return refused
     values |= _deviations(
-        [found] if intrinsics else [], [] if marker_map is None else [marker_map], config
+        [found] if source.find_lens else [], [] if marker_map is None else [marker_map], config
     )
     remarks = [f"readout_time {refused}"] if refused else []
     camera = found.fit.camera
-    _write_files(args, values, lens_parameters(camera), {"": camera}, writers, remarks)
-    if not found.processed:  # else the lens is that of a picture that was moved
-        print(f"next: {_next(args, intrinsics or args.calibration is not None, shape)}")
-    return True
+    lens = lens_parameters(camera)
+    write = partial(write_camera_file, values=values, lens=lens, remarks=remarks)
+    write_all({**writers, **_lens_writers(args, {"": camera}), out: write})
+    if refused:
+        refused += (
+            f"; written to {out} and beside it: lens, map; not written: readout time and "
+            "scan direction, which stay unknown: no twists"
+        )
+    if found.processed:  # the lens is that of a picture that was moved
+        return refused
+    # The lens of the file replaces the one in camera_info.
+    new_lens = source.find_lens or args.calibration is not None
+    words = ["replay", str(args.recording), "--camera" if new_lens else "--params", str(out)]
+    if shape is not None:  # of images; else the recording has matches
+        words += ["--map", str(shape), *(["--rate", str(args.rate)] if args.rate else [])]
+        words += [word for text in args.remaps for word in ("-r", text)]
+    words += ["--out", f"{out.with_suffix('')}_poses"]
+    print(f"next: {typed('rs_localizer', *words)}")
+    return refused
 
 
 def _deviations(
@@ -344,30 +339,10 @@ def _deviations(
     return known
 
 
-def _write_files(
-    args: Options, values: Mapping[str, Any], lens: Mapping[str, Any],
-    cameras: Mapping[str, Camera], writers: Writers, remarks: Sequence[str],
-) -> None:  # fmt: skip
-    """Write FILE.yaml, the files beside it, and the single lenses if they are wanted."""
-    for name, file in _lens_files(args, list(cameras)).items():
-        writers[file] = partial(write_calibration, camera=cameras[name])
-    write = partial(write_camera_file, values=values, lens=lens, remarks=remarks)
-    write_all({**writers, _out(args): write})
-
-
-def _next(args: Options, lens: bool, shape: Path | None) -> str:
-    """Return the command that makes poses of this recording with the calibration.
-
-    Args:
-        lens: whether the lens of the file replaces the one in camera_info.
-        shape: the map of images; None: the recording has matches.
-    """
-    out = _out(args)
-    words = ["replay", str(args.recording), "--camera" if lens else "--params", str(out)]
-    if shape is not None:
-        words += ["--map", str(shape), *(["--rate", str(args.rate)] if args.rate else [])]
-        words += [word for text in args.remaps for word in ("-r", text)]
-    return typed("rs_localizer", *words, "--out", f"{out.with_suffix('')}_poses")
+def _lens_writers(args: Options, cameras: Mapping[str, Camera]) -> Writers:
+    """Return what writes the single lenses, if they are wanted."""
+    files = _lens_files(args, list(cameras))
+    return {file: partial(write_calibration, camera=cameras[name]) for name, file in files.items()}
 
 
 def _calibrate_rig(args: Options) -> dict[str, Figures]:
@@ -380,21 +355,19 @@ def _calibrate_rig(args: Options) -> dict[str, Figures]:
     cameras = cameras_of(args, args.recordings, config)
     if args.out is not None:
         lenses = _lens_files(args, list(cameras)).values()
-        refuse_existing(args, args.out, _beside(args, _TRANSFORMS), *lenses)
-    intrinsics = args.intrinsics
-    for name, own in cameras.items():
+        refuse_existing(args, args.out, _beside(args.out, _TRANSFORMS), *lenses)
+    intrinsics = False
+    for name, (own, _) in cameras.items():
         print(f"{name}:")
         axis = config.of_cameras.get(name, config).scan_direction
-        of_camera = replace(config, scan_direction=axis)
-        source = _read(own.args, of_camera)
-        intrinsics |= source.new_lens
+        source = _read(own, replace(config, scan_direction=axis))
+        intrinsics |= source.find_lens
         maps += [] if source.map is None else [source.map]
         camera = _without_k3(replace(source.camera, scan_direction=axis))
-        recordings[name] = Recording(camera, _calibrated(own.args, source, camera, config))
-    refusals = {name: verdict.refusal(each.calibration) for name, each in recordings.items()}
-    refusals = {name: text for name, text in refusals.items() if text}
-    if refusals:
-        raise ValueError("; ".join(f"{name}: {text}" for name, text in refusals.items()))
+        recordings[name] = Recording(camera, _calibrated(own, source, camera, config))
+    said = {name: verdict.refusal(each.calibration) for name, each in recordings.items()}
+    if refusals := [f"{name}: {text}" for name, text in said.items() if text]:
+        raise ValueError("; ".join(refusals))
     rig = calibrate_rig(recordings)
     first, comments = next(iter(rig)), list[str]()
     for name, mounted in list(rig.items())[1:]:
@@ -407,22 +380,21 @@ def _calibrate_rig(args: Options) -> dict[str, Figures]:
                 f"rotation, place and offset are {times} times that"
             )
         if len(args.recordings) == 1 and is_bag(args.recordings[0]):
-            _compare_with_tf(args.recordings[0], mounted, cameras[name].frame, cameras[first].frame)
-    refusals = {name: text for name, one in rig.items() if (text := one.undetermined)}
-    if args.out is not None and not refusals:
-        frames = {name: own.frame for name, own in cameras.items()}
+            _compare_with_tf(args.recordings[0], mounted, cameras[name][1], cameras[first][1])
+    if refusals := [f"{name}: {one.undetermined}" for name, one in rig.items() if one.undetermined]:
+        raise ValueError(f"not observable: {'; '.join(refusals)}")
+    if args.out is not None:
+        frames = {name: frame for name, (_, frame) in cameras.items()}
         alone = [each.calibration for each in recordings.values()] if intrinsics else []
         parts = _parts(rig, recordings, config)
         values = rigs.node_parameters(parts) | _deviations(alone, maps, config)
         transforms = partial(rigs.write_static_transforms, parts=parts, frames=frames)
-        writers = Writers({_beside(args, _TRANSFORMS): transforms})
-        _write_files(args, values, rigs.mounted_lenses(parts), parts.cameras, writers, comments)
+        place, lens = _beside(args.out, _TRANSFORMS), rigs.mounted_lenses(parts)
+        write = partial(write_camera_file, values=values, lens=lens, remarks=comments)
+        single = _lens_writers(args, parts.cameras)
+        write_all({place: transforms, **single, args.out: write})
         when = "next" if shutil.which("ros2") else "next, in a ROS 2 workspace"
-        print(f"{when}: {shlex.join(['ros2', 'launch', str(_beside(args, _TRANSFORMS))])}")
-    if refusals:
-        raise ValueError(
-            "not observable: " + "; ".join(f"{name}: {text}" for name, text in refusals.items())
-        )
+        print(f"{when}: {shlex.join(['ros2', 'launch', str(place)])}")
     return {name: _figures(each.calibration) for name, each in recordings.items()}
 
 

@@ -87,7 +87,7 @@ def detect(args: Options) -> Figures:
             cameras = {"": args}
             if settings.of_cameras:
                 rig = cameras_of(args, [args.recording], settings)
-                cameras = {name: own.args for name, own in rig.items()}
+                cameras = {name: own for name, (own, _) in rig.items()}
             for name, own in cameras.items():
                 of = settings.of_cameras.get(name, settings)
                 with (
@@ -102,7 +102,9 @@ def detect(args: Options) -> Figures:
                 every.append(_figures(args, found))
                 print(f"{f'{args.out}, {name}' if name else args.out}: {_summary(args, found)}")
                 print("".join(f"note {note}\n" for note in found.notes), end="")
-                print_left_out(found.refused, found.carried)
+                print_left_out(found.refused)
+                if kept := [f"{topic} ({count})" for topic, count in found.carried.items()]:
+                    print(f"kept for replay: {', '.join(kept)}")
                 for fault in found.faults:
                     print(f"warning: {fault}")
                 print_times(source.clock, of.readout_time, found.period)

@@ -22,7 +22,7 @@ from rs_localizer.settings import build, camera_values
 
 if WORKING:
     from rs_localizer.core.camera import Camera
-    from rs_localizer.io.bags import BagReader, is_bag, open_bag
+    from rs_localizer.io.bags import is_bag, open_bag
     from rs_localizer.io.telemetry import Telemetry, has_telemetry, read_telemetry
     from rs_localizer.io.video import has_times
     from rs_localizer.offline.image_sources import (
@@ -63,7 +63,7 @@ class ImageOptions(LensOptions):
     )  # fmt: skip
 
 
-def given_lens(options: ImageOptions) -> Camera | None:
+def given_lens(options: LensOptions) -> Camera | None:
     """Return the camera of ``--camera``, if there is one."""
     return None if options.calibration is None else read_calibration(options.calibration)
 
@@ -110,39 +110,33 @@ def print_telemetry(args: ImageOptions, used: float | None = None) -> None:
         args: of the video.
         used: the measured readout time, s; None: the one of the settings is used.
     """
-    path = args.recording
-    settings = None if used is not None else build(shutter_values(args))
-    if not _has_telemetry(path):
+    ours = build(shutter_values(args)).readout_time if used is None else used
+    if not _has_telemetry(args.recording):
         return
     if not _can_read():
         print("note: the video has a gyroscope; to use it: pip install 'rs_localizer[video]'")
+    elif (telemetry := read_telemetry(args.recording)) is None:
         return
-    telemetry = read_telemetry(path)
-    if telemetry is None:
-        return
-    if telemetry.stabilizer:
+    elif telemetry.stabilizer:
         print(
             f"warning: {telemetry.camera} has stabilized this video ({telemetry.stabilizer}): its "
             "rows are not what the shutter saw, and poses are wrong; switch it off. Its gyroscope "
             "and readout time are not used"
         )
-        return
-    said = [f"gyroscope at {telemetry.rate:.0f} Hz"]
-    if telemetry.readout_time is not None:
-        said.append(f"readout time {1e3 * telemetry.readout_time:.2f} ms")
-        how, ours = ("measured", used) if settings is None else ("given", settings.readout_time)
-        if ours is not None and abs(ours / telemetry.readout_time - 1.0) > _SAME:
-            said[-1] += f" (not used: {1e3 * ours:.2f} ms was {how})"
-    print(f"{telemetry.camera}: {', '.join(said)}")
+    else:
+        said = f"{telemetry.camera}: gyroscope at {telemetry.rate:.0f} Hz"
+        if known := telemetry.readout_time:
+            said += f", readout time {1e3 * known:.2f} ms"
+            if abs(ours / known - 1.0) > _SAME:
+                how = "given" if used is None else "measured"
+                said += f" (not used: {1e3 * ours:.2f} ms was {how})"
+        print(said)
 
 
-def print_left_out(refused: Mapping[str, str], carried: Mapping[str, int]) -> None:
-    """Print images that could not be used, and other messages that are kept."""
+def print_left_out(refused: Mapping[str, str]) -> None:
+    """Print why images could not be used."""
     for detail in refused.values():
         print(f"images that cannot be used are left out, the first one because {detail}")
-    if carried:
-        kept = ", ".join(f"{topic} ({count})" for topic, count in carried.items())
-        print(f"kept for replay: {kept}")
 
 
 def print_times(clock: ImageClock | None, readout_time: float = 0.0, period: float = 0.0) -> None:
@@ -152,10 +146,11 @@ def print_times(clock: ImageClock | None, readout_time: float = 0.0, period: flo
         readout_time: s, as it was given.
         period: s from one image to the next.
     """
+    faults = [readout_fault(readout_time, period)]
     if clock is not None:
         print(clock.description())
-    of_clock = (clock.fault(), clock.slow_motion()) if clock is not None else ()
-    for fault in (*of_clock, readout_fault(readout_time, period)):
+        faults = [clock.fault(), clock.slow_motion(), *faults]
+    for fault in faults:
         if fault:
             print(f"warning: {fault}")
 
@@ -184,44 +179,29 @@ def opened(args: ImageOptions, calibrated: bool = True) -> Iterator[Source]:
     if is_bag(path):
         if args.rate is not None:
             raise UsageError("--rate is for videos and folders; a bag has its own times")
+        topics, info = remapped(args), None
         with open_bag(path) as bag:
-            yield _of_bag(bag, camera, remapped(args), calibrated)
+            topic = find_images(bag, topics.get(IMAGE))
+            if camera is None and (calibrated or INFO_TYPE in bag.topics.values()):
+                info = find_topic(bag, (INFO_TYPE,), topics.get(CAMERA_INFO), "-r camera_info:=")
+            yield Source(from_bag(bag, topic, info, camera), bag.count([topic]), None)
         return
     if args.remaps:
         raise UsageError("-r names topics of a bag")
     telemetry = telemetry_of(path) if calibrated else None
     if camera is None and calibrated:
         raise UsageError("a video or folder has no camera_info: give --camera")
+    clock, total = ImageClock(args.rate), None
     if path.is_dir():
-        source = _of_folder(path, camera, args.rate)
-    else:
-        source = _of_video(path, camera, args.rate)
-    if telemetry is not None and source.clock is not None:
-        source = replace(source, shots=with_telemetry(source.shots, telemetry, source.clock))
-    yield source
-
-
-def _of_bag(
-    bag: BagReader, camera: Camera | None, topics: Mapping[str, str], calibrated: bool
-) -> Source:
-    topic = find_images(bag, topics.get(IMAGE))
-    info = None
-    if camera is None and (calibrated or INFO_TYPE in bag.topics.values()):
-        info = find_topic(bag, (INFO_TYPE,), topics.get(CAMERA_INFO), "-r camera_info:=")
-    return Source(from_bag(bag, topic, info, camera), bag.count([topic]), None)
-
-
-def _of_folder(path: Path, camera: Camera | None, rate: float | None) -> Source:
-    files, clock = image_files(path), ImageClock(rate)
-    if rate is None and name_times(files) is None:
-        raise UsageError("the names of the files are not times: give --rate")
-    return Source(from_files(files, camera, clock), len(files), clock)
-
-
-def _of_video(path: Path, camera: Camera | None, rate: float | None) -> Source:
-    if rate is None and not has_times(path):
+        files = image_files(path)
+        if args.rate is None and name_times(files) is None:
+            raise UsageError("the names of the files are not times: give --rate")
+        shots, total = from_files(files, camera, clock), len(files)
+    elif args.rate is None and not has_times(path):
         raise UsageError(
             "this video has no presentation times: give --rate; the readout time scales with it"
         )
-    clock = ImageClock(rate)
-    return Source(from_video(path, camera, clock), None, clock)
+    else:
+        shots = from_video(path, camera, clock)
+    read = shots if telemetry is None else with_telemetry(shots, telemetry, clock)
+    yield Source(read, total, clock)

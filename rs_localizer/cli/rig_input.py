@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -32,14 +32,6 @@ if WORKING:
 T = TypeVar("T", bound=LensOptions)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class OfRig(Generic[T]):
-    """One camera of the recordings."""
-
-    args: T  # as of a recording of this camera alone
-    frame: str  # of its optical axes
-
-
 def check_there(recordings: Sequence[Path]) -> None:
     """Raise ValueError for one that does not exist, before any other has been read."""
     for path in recordings:
@@ -47,8 +39,11 @@ def check_there(recordings: Sequence[Path]) -> None:
             raise ValueError(f"{path} does not exist")
 
 
-def cameras_of(args: T, recordings: Sequence[Path], config: NodeConfig) -> dict[str, OfRig[T]]:
-    """Return the cameras of recordings by name: of one bag, or of a recording of each."""
+def cameras_of(args: T, recordings: Sequence[Path], config: NodeConfig) -> dict[str, tuple[T, str]]:
+    """Return the cameras of one bag, or of a recording of each, by name.
+
+    Of each: the options of a recording of this camera alone, and the frame of its optical axes.
+    """
     if len(recordings) > 1:
         names = [re.sub(r"\W", "_", path.stem, flags=re.ASCII) for path in recordings]
         topics: list[dict[str, Any]] = [{"recording": path} for path in recordings]
@@ -67,8 +62,8 @@ def cameras_of(args: T, recordings: Sequence[Path], config: NodeConfig) -> dict[
     cameras = {}
     for name, own, frame in zip(names, topics, frames, strict=True):
         calibration = None if lens is None else lens.with_name(f"{lens.name}#{name}")
-        of_camera = replace(args, **own, calibration=calibration)
-        cameras[name] = OfRig(of_camera, frame or f"{name}_optical_frame")
+        alone = replace(args, **own, calibration=calibration)
+        cameras[name] = alone, frame or f"{name}_optical_frame"
     return cameras
 
 
@@ -144,24 +139,20 @@ def map_cameras(args: T, recordings: Sequence[Path], config: NodeConfig) -> list
         raise UsageError(f"no readout_time of {', '.join(lacking)}: calibrate --rig finds it")
     first = given[next(iter(sources))].inverse()
     cameras = list[MapCamera[T]]()
-    for name, own in sources.items():
+    for name, (own, _) in sources.items():
         pose, mounting = given[name] @ first, None
         if cameras:
             extrinsics = Extrinsics(pose.rotation, -pose.rotation.T @ pose.translation, 0.0)
             mounting = MountPrior(extrinsics, np.repeat(DETERMINED, [3, 3, 1]))
-        shutter = {each.name: getattr(shutters[name], each.name) for each in fields(CameraSettings)}
-        cameras.append(MapCamera(name, own.args, replace(config, **shutter), mounting))
+        cameras.append(MapCamera(name, own, replace(config, **asdict(shutters[name])), mounting))
     return cameras
 
 
-def _by_tf(sources: Mapping[str, OfRig[T]]) -> dict[str, Transform]:
+def _by_tf(sources: Mapping[str, tuple[LensOptions, str]]) -> dict[str, Transform]:
     """Return poses of the cameras by TF of a bag, in the axes of the first of them."""
-    first = next(iter(sources.values()))
-    path = first.args.recording
-    if not is_bag(path):
+    args, first = next(iter(sources.values()))
+    if not is_bag(args.recording):
         return {}
-    with open_bag(path) as bag:
-        poses = {
-            name: transform_between(bag, own.frame, first.frame) for name, own in sources.items()
-        }
+    with open_bag(args.recording) as bag:
+        poses = {name: transform_between(bag, own, first) for name, (_, own) in sources.items()}
     return {name: pose for name, pose in poses.items() if pose is not None}

@@ -63,7 +63,7 @@ def look_at_images(args: Options, points: Sequence[_Point], looker: Looker) -> L
     for name, seconds, *_ in points:
         if seconds not in looked.moments:
             raise UsageError(f"--point {name}: the images end before {seconds:g} s")
-    print_left_out(looked.refused, {})
+    print_left_out(looked.refused)
     print_times(source.clock, build(shutter_values(args)).readout_time, looked.period)
     return looked
 

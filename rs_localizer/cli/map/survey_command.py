@@ -117,7 +117,7 @@ def _filmed(given: MapCamera[Options], spotter: Spotter) -> Filmed:
                 raise ValueError("camera_info changes within the recording; cut it there")
             camera, stamp = own, image.stamp_ns
             spotted[stamp] = spotter.spot(image.pixels, stamp)
-    print_left_out(refused, {})
+    print_left_out(refused)
     print_times(source.clock)
     if camera is None:
         raise ValueError(f"{args.recording} has no image that can be read")
