@@ -37,7 +37,6 @@ if WORKING:
     from rs_localizer.offline.image_sources import holds_images, image_topics
     from rs_localizer.offline.replay import has_frames, imu_topics, prepare
     from rs_localizer.offline.results import Smooth, Tally, figures, summary, write_results
-    from rs_localizer.pipeline.frames import FrameLocalizer
     from rs_localizer.settings import build
 
 if TYPE_CHECKING:
@@ -87,7 +86,7 @@ def run(options: Options) -> Figures | None:
         _replay_all(options)
         return None
     recording = options.recordings[0]
-    out = options.out or Path(f"{_name(recording)}_replay")
+    out = options.out or Path(f"{recording.resolve().with_suffix('').name}_replay")
     return {"out": str(out)} | figures(_replay_one(options, recording, out))
 
 
@@ -116,11 +115,6 @@ def _settings(options: Options) -> NodeConfig:
     files = {"map_file": options.map, "camera_file": options.calibration}
     given = {name: str(file) for name, file in files.items() if file is not None}
     return build(given_values(options) | given)
-
-
-def _name(recording: Path) -> str:
-    """Return a recording's own name, for its results."""
-    return recording.resolve().with_suffix("").name
 
 
 def _pictures(recording: Path) -> str:
@@ -225,8 +219,14 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
             tqdm(total=tally.total, unit="frame", desc="replay", disable=None) as bar,
         ):
             built.mkdir()
-            _hint_at_settings(path, options.params)
-            smooth = _smoothing(localizer, options.pose_rate) if options.smooth else None
+            own = (path if path.is_dir() else path.parent) / PARAMETERS
+            if options.params is None and own.is_file():
+                print(f"the recording has settings of its own: --params {shlex.quote(str(own))}")
+            smooth: Smooth | None = None
+            if options.smooth:
+                from rs_localizer.tools.smoothed import smooth_frames  # with SciPy
+
+                smooth = functools.partial(smooth_frames, localizer, rate=options.pose_rate)
             tally.done = bar.update
             write_results(bag, topics, localizer, tally, built, smooth)
         _print_summary(tally, config, out, timed)
@@ -239,21 +239,9 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
     return tally
 
 
-def _smoothing(localizer: FrameLocalizer, rate: float | None) -> Smooth:
-    from rs_localizer.tools.smoothed import smooth_frames  # with SciPy
-
-    return lambda frames, stamps: smooth_frames(localizer, frames, stamps, rate)
-
-
 def _write_table(tables: list[Table], file: Path) -> None:
     rows = frame_table.write_parquet(tables, file)
     print(f"written to {file}: {rows} rows, one a frame")
-
-
-def _hint_at_settings(bag: Path, params: Path | None) -> None:
-    file = (bag if bag.is_dir() else bag.parent) / "parameters.yaml"
-    if params is None and file.is_file():
-        print(f"the recording has settings of its own: --params {shlex.quote(str(file))}")
 
 
 def _print_summary(tally: Tally, config: NodeConfig, out: Path, timed: bool) -> None:
