@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, earlier_result, refuse_existing, write_all
-from rs_localizer.cli.image_input import LensOptions
+from rs_localizer.cli.image_input import LensOptions, given_lens
 from rs_localizer.cli.map import check_readout
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.cli.rig_input import MapCamera, map_cameras, mounting_lines
@@ -26,7 +26,7 @@ if WORKING:
     from rs_localizer.core.arrays import Array
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.bags import open_bag
-    from rs_localizer.io.camera_files import read_calibration, write_calibration
+    from rs_localizer.io.camera_files import write_calibration
     from rs_localizer.io.clouds import Correspondences
     from rs_localizer.io.maps.colmap import read_model, write_model
     from rs_localizer.io.maps.landmarks import Map, MapError
@@ -101,13 +101,10 @@ def _recorded(
     with open_bag(args.recording) as bag:
         topics = find_topics(bag, given_topics(args)).without(IMU)
         recorded = read_recording(bag, topics, landmarks)
-    camera = recorded.calibration.camera(config.readout_time, config.scan_direction)
-    if args.calibration is not None:
-        camera = replace(
-            read_calibration(args.calibration),
-            readout_time=config.readout_time,
-            scan_direction=config.scan_direction,
-        )
+    shutter = config.readout_time, config.scan_direction
+    camera = recorded.calibration.camera(*shutter)
+    if lens := given_lens(args):
+        camera = replace(lens, readout_time=shutter[0], scan_direction=shutter[1])
     return RigCamera(camera, config.stamp_offset, of.mounting), recorded.clouds
 
 
@@ -186,15 +183,13 @@ def _undo_shutter(args: Options, folder: Path, out: Path) -> None:
         model = read_model(folder)
     except MapError as error:
         raise MapError(f"{folder}: {error}") from error
-    camera = model.camera if args.calibration is None else read_calibration(args.calibration)
-    stamps = image_stamps(list(model.images), args.rate)
+    camera, stamps = given_lens(args) or model.camera, image_stamps(list(model.images), args.rate)
     values = given_values(args)
-    readout = build(values).readout_time or None
-    direction = str(build(values).scan_direction)
-    known = direction if readout or "scan_direction" in values else None
-    earlier = earlier_result(replace(args, out=out), "images.txt")
-    with atomic_directory(out, earlier) as built:
-        result = undo_shutter(camera, model, stamps, (readout, known), args.intrinsics, _step)
+    config = build(values)
+    known = config.readout_time or "scan_direction" in values
+    shutter = config.readout_time or None, str(config.scan_direction) if known else None
+    with atomic_directory(out, earlier_result(args, "images.txt", out)) as built:
+        result = undo_shutter(camera, model, stamps, shutter, args.intrinsics, _step)
         check_readout(result.readout_check)
         built.mkdir()
         write_model(built, result.camera, result.images, result.points)
