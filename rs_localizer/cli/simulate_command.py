@@ -53,7 +53,6 @@ if WORKING:
     from rs_localizer.tools.simulation.simulated_keypoints import (
         keypoint_rows,
         random_descriptors,
-        write_keypoints,
     )
     from rs_localizer.tools.simulation.simulated_recording import write_simulated
     from rs_localizer.tools.simulation.simulated_rig import (
@@ -285,11 +284,7 @@ class _Recorder:
         with self._bag(folder) as bag:
             frames = see(args, self.world, camera, self._motion, stamps)
             for frame in tqdm(frames, "simulate", len(stamps), unit="frame", disable=None):
-                rows = self._keypoints(frame)
-                if rows is None:
-                    write_simulated(bag, camera, frame)
-                else:
-                    write_keypoints(bag, camera, frame, rows)
+                write_simulated(bag, camera, frame, self._keypoints(frame))
         direction = str(camera.scan_direction)
         return {"readout_time": camera.readout_time, "scan_direction": direction}
 

@@ -7,18 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.core.camera import Camera
-from rs_localizer.io.bags import BagWriter, make_message
-from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.landmarks import Descriptors, Map
-from rs_localizer.io.recording import (
-    CAMERA_FRAME,
-    CAMERA_INFO_TOPIC,
-    KEYPOINTS_TOPIC,
-    make_camera_info,
-)
 from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame
-from rs_localizer.tools.simulation.simulated_recording import write_truths
 
 # Share of the bits that differ between two views of a landmark; ORB's median is about this.
 BIT_ERRORS = 0.1
@@ -59,14 +49,3 @@ def keypoint_rows(frame: SimulatedFrame, landmarks: Map, rng: np.random.Generato
     if landmarks.descriptors is not None:
         rows["descriptor"] = seen_descriptors(landmarks.descriptors[frame.ids], rng)
     return rows
-
-
-def write_keypoints(
-    bag: BagWriter, camera: Camera, frame: SimulatedFrame, rows: NDArray[Any]
-) -> None:
-    """Write camera info, keypoints, and the truth at the first and the middle row."""
-    stamp_ns = frame.stamp_ns
-    bag.write(CAMERA_INFO_TOPIC, make_camera_info(camera, stamp_ns), stamp_ns)
-    cloud = make_cloud(make_message, stamp_ns, CAMERA_FRAME, rows)
-    bag.write(KEYPOINTS_TOPIC, cloud, stamp_ns)
-    write_truths(bag, frame)

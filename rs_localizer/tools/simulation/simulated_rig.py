@@ -14,20 +14,12 @@ from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.io import topics
 from rs_localizer.io.bags import BagWriter, make_message
-from rs_localizer.io.clouds import make_cloud
-from rs_localizer.io.recording import (
-    RAW_IMAGE_TOPIC,
-    make_camera_info,
-    make_correspondences,
-    make_image,
-)
 from rs_localizer.io.rigs import RigParts, node_parameters
 from rs_localizer.io.transforms import Transform, make_transform
-from rs_localizer.tools.simulation.renderer import FORMAT, RenderedFrame
+from rs_localizer.tools.simulation.renderer import RenderedFrame
 from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, frame_stamps
-from rs_localizer.tools.simulation.simulated_recording import write_truth
+from rs_localizer.tools.simulation.simulated_recording import view_messages, write_truth
 from rs_localizer.tools.simulation.true_motion import TrueMotion, TrueState
 
 # Relative error of the rates of cameras' oscillators: common quartz.
@@ -155,15 +147,6 @@ def write_rig_frame(
     recorded_ns = frame.stamp_ns + round(camera.readout_time * 1e9)
     for time_ns in sorted({frame.stamp_ns, frame.middle_ns}):
         write_truth(bag, time_ns, motion.state(time_ns, np.zeros(1)), RIG_FRAME, recorded_ns)
-    optical = optical_frame(image.name)
-    info = make_camera_info(camera, stamp_ns, optical)
-    bag.write(f"/{image.name}/{topics.CAMERA_INFO}", info, recorded_ns)
-    if isinstance(frame, RenderedFrame):
-        picture = make_image(stamp_ns, FORMAT, frame.data, optical)
-        bag.write(f"/{image.name}{RAW_IMAGE_TOPIC}", picture, recorded_ns)
-    elif keypoints is None:
-        cloud = make_correspondences(stamp_ns, frame.points, frame.pixels, frame.ids)
-        bag.write(f"/{image.name}/{topics.CORRESPONDENCES}", cloud, recorded_ns)
-    else:
-        cloud = make_cloud(make_message, stamp_ns, optical, keypoints)
-        bag.write(f"/{image.name}/{topics.KEYPOINTS}", cloud, recorded_ns)
+    messages = view_messages(camera, frame, stamp_ns, keypoints, optical_frame(image.name))
+    for topic, message in messages.items():
+        bag.write(f"/{image.name}{topic}", message, recorded_ns)
