@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -11,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rs_localizer.cli import WORKING, import_ros, simulate_command, stage
+from rs_localizer.cli import WORKING, detect_command, import_ros, simulate_command, stage
 from rs_localizer.cli.options import option
 from rs_localizer.cli.typed import typed
 from rs_localizer.config import NodeConfig
@@ -20,7 +22,6 @@ if WORKING:
     import numpy as np
 
     from rs_localizer import data
-    from rs_localizer.core import so3
     from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.io.bags import open_bag
     from rs_localizer.io.camera_info import read_camera_info
@@ -29,19 +30,15 @@ if WORKING:
     from rs_localizer.io.recording import (
         CAMERA_INFO_TOPIC,
         CORRESPONDENCES_TOPIC,
-        make_camera_info,
-        make_correspondences,
+        MARKER_MAP,
+        PARAMETERS,
     )
-    from rs_localizer.io.trajectories import Motions, Trajectory, Twists
-    from rs_localizer.markers.detection import MarkerDetector
+    from rs_localizer.io.trajectories import Motions, read_motions
     from rs_localizer.offline.results import Track
     from rs_localizer.pipeline.camera_frames import CameraFrames
     from rs_localizer.settings import build, load_params_file
     from rs_localizer.tools import errors
-    from rs_localizer.tools.simulation.renderer import Renderer, in_order
-    from rs_localizer.tools.simulation.simulated_frames import middle_stamp
-    from rs_localizer.tools.simulation.simulated_settings import ImageSettings
-    from rs_localizer.tools.simulation.walls import Scene
+    from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 
 # Parts of the bundled hand's motion: start and duration, s. The flight begins slowly and ends in
 # quick turns; before the walls the hand turns about all axes, by up to 200 deg/s.
@@ -73,12 +70,12 @@ def run(options: Options) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     most = _QUICK_FRAMES if options.quick else None
     print(f"{'medians':56}{_METHODS[0]:>9}{_METHODS[1]:>9}", flush=True)
-    flight, readout_time, true = _simulated(most, images=False)
+    flight, readout_time, true = _simulated(most)
     answers, found = _localized("Simulated flight", flight, readout_time, true)
     with atomic_files(picture) as (part,):
         errors.draw(found, part)
     webcam = data.path(data.WEBCAM)
-    of_webcam = build(load_params_file(webcam / "parameters.yaml")).readout_time
+    of_webcam = build(load_params_file(webcam / PARAMETERS)).readout_time
     _localized("Webcam over a board", read_frames(webcam, most), of_webcam, None)
     if options.all:
         _localized("Walls of markers", *_simulated(most, images=True))
@@ -103,34 +100,23 @@ def read_frames(path: Path, most: int | None = None) -> list[FrameMessages]:
     return frames[:most]
 
 
-def _simulated(most: int | None, images: bool) -> tuple[list[FrameMessages], float, Motions]:
+def _simulated(
+    most: int | None, images: bool = False
+) -> tuple[list[FrameMessages], float, Motions]:
     """Return frames of a flight, or of rendered walls, the readout time (s), and the truth."""
     start, duration = _WALLS if images else _FLIGHT
-    args = simulate_command.Options(
-        out=Path(), trajectory=Path(simulate_command.BUNDLED), images=images,
-        start=start, duration=duration,
-    )  # fmt: skip
-    camera, motion = simulate_command.camera_of(args), simulate_command.motion_of(args)
-    stamps = simulate_command.stamps_of(args, camera, motion)[:most]
-    world = simulate_command.world_of(args, motion, np.random.default_rng(args.seed))
-    if isinstance(world, Scene):
-        assert world.marker_map is not None
-        renderer = Renderer(camera, world.planes, ImageSettings(exposure=_EXPOSURE))
-        detector = MarkerDetector(world.marker_map)
-        seen: Any = in_order(lambda it: detector.detect(renderer.image(motion, it)), stamps)
-    else:
-        seen = simulate_command.see(args, world, camera, motion, stamps)
-    frames = list[FrameMessages]()
-    with stage("Simulating", len(stamps)) as step:
-        for stamp, each in zip(stamps, seen, strict=True):
-            cloud = make_correspondences(stamp, each.points, each.pixels, each.ids)
-            frames.append(FrameMessages(stamp, make_camera_info(camera, stamp), cloud))
-            step(1)
-    middle = np.array([middle_stamp(camera, stamp) for stamp in stamps], np.int64)
-    state = motion.state(int(middle[0]), 1e-9 * (middle - middle[0]))
-    turns = np.array([so3.quaternion(np.ascontiguousarray(R)) for R in state.rotations])
-    poses = Trajectory(middle, state.positions, turns)
-    return frames, camera.readout_time, Motions(poses, Twists(middle, state.angular, state.linear))
+    with tempfile.TemporaryDirectory() as place, contextlib.redirect_stdout(io.StringIO()):
+        made = matches = Path(place) / "simulated"
+        simulate_command.run(simulate_command.Options(
+            out=made, trajectory=Path(simulate_command.BUNDLED), images=images, start=start,
+            duration=duration if most is None else most / FrameSettings().rate,
+            exposure=_EXPOSURE if images else 0.0,
+        ))  # fmt: skip
+        if images:
+            matches, markers = Path(place) / "matches", made / MARKER_MAP
+            detect_command.detect(detect_command.Options(recording=made, map=markers, out=matches))
+        readout_time = build(load_params_file(made / PARAMETERS)).readout_time
+        return read_frames(matches), readout_time, read_motions(made)
 
 
 def _localized(
