@@ -173,10 +173,6 @@ def _of_features(args: Options) -> tuple[Mapping[str, float], Detection]:
             raise UsageError(f"--{name} is for markers; give it or --features")
     most = args.max_keypoints or FeatureConfig().max_keypoints
     extractor = FrameExtractor(FeatureConfig(features=args.features or "", max_keypoints=most))
-
-    def detect_images(
-        shots: Shots, bag: BagWriter, options: offline.DetectionOptions, bar: Any
-    ) -> Extraction:
-        return record_features(shots, extractor, bag, options, bar.update)
-
-    return {}, detect_images
+    return {}, lambda shots, bag, options, bar: record_features(
+        shots, extractor, bag, options, bar.update
+    )

@@ -155,7 +155,7 @@ class Options(MotionOptions, CameraOptions, ResultOptions):
     seed: int = option("of all random numbers", "N", 0, least=0)
 
 
-def camera_of(args: Options) -> Camera:
+def _camera(args: Options) -> Camera:
     """Return the camera of ``--camera``, or a webcam, with the shutter of the options."""
     lens = Camera(640, 480, pinhole_matrix(500.0, 500.0, 319.5, 239.5), readout_time=_READOUT_TIME)
     values = dict[str, Any]()
@@ -167,13 +167,8 @@ def camera_of(args: Options) -> Camera:
     return replace(lens, readout_time=config.readout_time, scan_direction=config.scan_direction)
 
 
-def motion_of(args: Options) -> TrueMotion:
-    """Return the recorded motion, or one at constant velocity; it vibrates where that is wanted."""
-    rng = np.random.default_rng([args.seed, _VIBRATION_STREAM])
-    return shaken(_smooth_motion(args), args.vibration, rng)
-
-
 def _smooth_motion(args: Options) -> TrueMotion:
+    """Return the recorded motion, or one at constant velocity."""
     angular, linear = args.angular_velocity, args.linear_velocity
     if args.trajectory is not None:
         if (angular, linear) != (None, None):
@@ -190,7 +185,7 @@ def _smooth_motion(args: Options) -> TrueMotion:
     )
 
 
-def stamps_of(args: Options, camera: Camera, motion: TrueMotion) -> list[int]:
+def _stamps(args: Options, camera: Camera, motion: TrueMotion) -> list[int]:
     """Return the times at which the frames begin, ns; ValueError when there are none."""
     start_ns = motion.intervals_ns[0][0] + round(args.start * 1e9)
     end_ns = math.inf if args.duration is None else start_ns + round(args.duration * 1e9)
@@ -201,7 +196,7 @@ def stamps_of(args: Options, camera: Camera, motion: TrueMotion) -> list[int]:
     return stamps
 
 
-def world_of(args: Options, motion: TrueMotion, rng: np.random.Generator) -> Scene | Array:
+def _world(args: Options, motion: TrueMotion, rng: np.random.Generator) -> Scene | Array:
     """Return surroundings of a motion: a scene to be rendered, or the points (n,3) of a room."""
     if args.images:
         return SCENES[args.walls](sampled_states(motion))
@@ -212,7 +207,7 @@ def world_of(args: Options, motion: TrueMotion, rng: np.random.Generator) -> Sce
     return room(np.concatenate(ways), rng)
 
 
-def see(
+def _see(
     args: Options, world: Scene | Array, camera: Camera, motion: TrueMotion, stamps: list[int],
     place: int = 0,
 ) -> Iterator[SimulatedFrame | RenderedFrame]:  # fmt: skip
@@ -245,13 +240,15 @@ class _Recorder:
     """Writes the views of cameras in a world."""
 
     def __init__(self, args: Options) -> None:
-        self._args, self._motion = args, motion_of(args)
+        vibrating = np.random.default_rng([args.seed, _VIBRATION_STREAM])
+        self._args = args
+        self._motion = shaken(_smooth_motion(args), args.vibration, vibrating)
         self._parts = None if args.rig is None else read_camchain(args.rig)
-        cameras = [camera_of(args)] if self._parts is None else [*self._parts.cameras.values()]
+        cameras = [_camera(args)] if self._parts is None else [*self._parts.cameras.values()]
         self._camera = cameras[0]
-        self.stamps = stamps_of(args, self._camera, self._motion)
+        self.stamps = _stamps(args, self._camera, self._motion)
         self._rng = np.random.default_rng(args.seed)
-        self.world = world_of(args, self._motion, self._rng)
+        self.world = _world(args, self._motion, self._rng)
         self.counts = list[int]()  # points of the frames
         self._map: Map | None = None
         if args.keypoints and not isinstance(self.world, Scene):
@@ -282,7 +279,7 @@ class _Recorder:
     def _write_camera(self, folder: Path) -> dict[str, Any]:
         args, camera, stamps = self._args, self._camera, self.stamps
         with self._bag(folder) as bag:
-            frames = see(args, self.world, camera, self._motion, stamps)
+            frames = _see(args, self.world, camera, self._motion, stamps)
             for frame in tqdm(frames, "simulate", len(stamps), unit="frame", disable=None):
                 write_simulated(bag, camera, frame, self._keypoints(frame))
         direction = str(camera.scan_direction)
@@ -306,7 +303,7 @@ class _Recorder:
 
         def frames(name: str, mounted: TrueMotion, place: int) -> Any:
             camera = parts.cameras[name]
-            return see(self._args, self.world, camera, mounted, stamps[name], place)
+            return _see(self._args, self.world, camera, mounted, stamps[name], place)
 
         with BagWriter(folder) as bag:
             bag.write(TF_STATIC, make_mounts(parts), first)
