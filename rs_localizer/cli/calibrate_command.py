@@ -17,7 +17,7 @@ from rs_localizer.cli import WORKING, image_input, refuse_existing, write_all
 from rs_localizer.cli.image_input import ImageOptions, given_lens
 from rs_localizer.cli.marker_map import TargetOptions, find_map
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
-from rs_localizer.cli.rig_input import cameras_of, mounting_lines
+from rs_localizer.cli.rig_input import cameras_of, check_there, mounting_lines
 from rs_localizer.cli.settings_args import given_settings, given_topics, remapped
 from rs_localizer.cli.typed import typed
 from rs_localizer.io.image_clock import DEFAULT_START_NS
@@ -181,8 +181,7 @@ def _calibrated(
 
 def _read(args: Options, config: NodeConfig) -> _Input:
     path = args.recording
-    if not path.exists():
-        raise ValueError(f"{path} does not exist")
+    check_there([path])
     of_bag = is_bag(path)
     imu = _imu(args, path) if args.imu else None
     if of_bag and IMAGE not in remapped(args):

@@ -44,43 +44,43 @@ def cameras_of(args: T, recordings: Sequence[Path], config: NodeConfig) -> dict[
 
     Of each: the options of a recording of this camera alone, and the frame of its optical axes.
     """
+    found: list[tuple[str, dict[str, Any], str]]
     if len(recordings) > 1:
-        names = [re.sub(r"\W", "_", path.stem, flags=re.ASCII) for path in recordings]
-        topics: list[dict[str, Any]] = [{"recording": path} for path in recordings]
-        frames = [f"{name}_optical_frame" for name in names]
+        found = [
+            (re.sub(r"\W", "_", path.stem, flags=re.ASCII), {"recording": path}, "")
+            for path in recordings
+        ]
     else:
-        (path,) = recordings
-        names, topics, frames = _in_one_bag(path, config.cameras if config.of_cameras else None)
+        found = _in_one_bag(recordings[0], config.cameras if config.of_cameras else None)
+    names = [name for name, _, _ in found]
     if len(set(names)) < max(len(names), 2) or not all(name[:1].isalpha() for name in names):
         raise UsageError(
             f"--rig: cameras need different names that begin with a letter: {', '.join(names)}"
         )
     check_there(recordings)
-    if len(set(frames)) < len(frames):  # as of single recordings put together
-        frames = [""] * len(frames)
-    lens = args.calibration
-    cameras = {}
-    for name, own, frame in zip(names, topics, frames, strict=True):
+    # Single recordings that were put together have one frame.
+    differ = len({frame for _, _, frame in found}) == len(found)
+    cameras, lens = {}, args.calibration
+    for name, own, frame in found:
         calibration = None if lens is None else lens.with_name(f"{lens.name}#{name}")
         alone = replace(args, **own, calibration=calibration)
-        cameras[name] = alone, frame or f"{name}_optical_frame"
+        cameras[name] = alone, (differ and frame) or f"{name}_optical_frame"
     return cameras
 
 
-def _in_one_bag(
-    path: Path, given: Sequence[str] | None
-) -> tuple[list[str], list[dict[str, Any]], list[str]]:
-    """Return names of the cameras of a bag, the topics of each, and its frame."""
+def _in_one_bag(path: Path, given: Sequence[str] | None) -> list[tuple[str, dict[str, Any], str]]:
+    """Return name, topics as options, and frame of each camera of a bag."""
     if not is_bag(path):
         raise UsageError(f"--rig needs the recordings of several cameras, or one bag; got {path}")
     with open_bag(path) as bag:
-        by_name = camera_topics(bag, given)
-        frames = [optical_frame(bag, own["camera_info"]) for own in by_name.values()]
-    topics = [
-        {"recording": path, "remaps": [f"{name}:={topic}" for name, topic in own.items()]}
-        for own in by_name.values()
-    ]
-    return list(by_name), topics, frames
+        return [
+            (
+                name,
+                {"recording": path, "remaps": [f"{it}:={topic}" for it, topic in own.items()]},
+                optical_frame(bag, own["camera_info"]),
+            )
+            for name, own in camera_topics(bag, given).items()
+        ]
 
 
 def mounting_lines(name: str, first: str, mounted: Extrinsics, deviations: Array) -> list[str]:

@@ -20,6 +20,7 @@ from rs_localizer.cli.image_input import (
     shutter_values,
 )
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, number, option
+from rs_localizer.cli.rig_input import check_there
 from rs_localizer.cli.typed import typed
 from rs_localizer.config import FeatureConfig
 
@@ -95,8 +96,7 @@ def run(args: Options) -> None:
     points = _points(args)
     distances = _distances(args, [name for name, *_ in points])
     require()
-    if not args.recording.exists():
-        raise ValueError(f"{args.recording} does not exist")
+    check_there([args.recording])
     markers = None if args.markers is None else read_checked_map(args.markers)
     print_telemetry(args)
     shutter, frame = shutter_of(args), MAP_FRAME if markers is None else markers.map_frame
