@@ -56,6 +56,7 @@ from rs_localizer.estimation.prior import (
     assumptions,
     of_frame,
     state_in,
+    unchecked,
     with_motion,
 )
 from rs_localizer.estimation.robust import GATE, WIDEST_GATE, best_motion
@@ -411,7 +412,7 @@ class Localizer:
         covariance = np.array(prior.covariance, float)
         covariance[POSE] = covariance[:, POSE] = 0.0
         np.fill_diagonal(covariance[POSE, POSE], np.inf)
-        of_velocities = replace(prior, covariance=covariance)
+        of_velocities = unchecked(prior, covariance=covariance)
         turned = observed.sighted.rotation is not None
         return with_motion(observed.terms, of_velocities, observed.centre, turned)
 

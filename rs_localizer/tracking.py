@@ -41,7 +41,7 @@ from rs_localizer.core.state import (
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.estimation.known_rotation import Aid, Foretold, LastFrame
-from rs_localizer.estimation.prior import Prior, beside
+from rs_localizer.estimation.prior import Prior, beside, unchecked
 from rs_localizer.estimation.window import (
     FADING,
     LENGTH,
@@ -602,7 +602,7 @@ class Tracker:
             prior = replace(prior, covariance=_UNKNOWN, of_rest=rest)
         if rotation is None:
             if prior is not None and self._track is not None:
-                prior = replace(prior, of_vibration=self._track.vibrations)
+                prior = unchecked(prior, of_vibration=self._track.vibrations)
             return prior
         return None if prior is None else beside(prior, rotation)
 

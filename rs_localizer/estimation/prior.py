@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -58,19 +58,26 @@ def check_motion(motion: Motion) -> None:
     Raises:
         ValueError: wrong shapes, values that are not finite, a rotation that is none.
     """
-    for each in fields(Motion):
-        value, shape = getattr(motion, each.name), (3, 3) if each.name == "rotation" else (3,)
+    names = [each.name for each in fields(Motion)]
+    for name in names:
+        value, shape = getattr(motion, name), (3, 3) if name == "rotation" else (3,)
         if np.shape(value) != shape:
             raise ValueError(
-                f"the prior motion's {each.name} must be of shape {shape}, got {np.shape(value)}"
+                f"the prior motion's {name} must be of shape {shape}, got {np.shape(value)}"
             )
-        if not np.all(np.abs(value) < _FARTHEST):  # NaN is not
-            raise ValueError(f"the prior motion's {each.name} is not finite: {value}")
-    rotation = np.asarray(motion.rotation, float)
-    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if not (off <= _ROUNDING and np.linalg.det(rotation) > 0.0):
-        found = rotation.tolist()
-        raise ValueError(f"the prior motion's rotation is not orthonormal: {found}")
+    numbers = state_in(motion, _STILL[9:12])
+    if not np.abs(numbers).max() < _FARTHEST:  # NaN is not
+        for name in names:
+            value = np.asarray(getattr(motion, name), float)
+            if not np.all(np.abs(value) < _FARTHEST):
+                raise ValueError(f"the prior motion's {name} is not finite: {value}")
+    rotation = numbers[:9].reshape(3, 3)
+    off = np.abs(rotation @ rotation.T - _STILL[:9].reshape(3, 3)).max()
+    x, y, z = rotation.tolist()
+    volume = x[0] * (y[1] * z[2] - y[2] * z[1]) + x[1] * (y[2] * z[0] - y[0] * z[2])
+    volume += x[2] * (y[0] * z[1] - y[1] * z[0])
+    if not (off <= _ROUNDING and volume > 0.0):
+        raise ValueError(f"the prior motion's rotation is not orthonormal: {rotation.tolist()}")
 
 
 def check_covariance(covariance: Array) -> None:
@@ -152,6 +159,14 @@ class Prior:
                     f"{name}_deviation must be at least {_LEAST_DEVIATION:g} and finite, "
                     f"got {deviation}"
                 )
+
+
+def unchecked(prior: Prior, **changed: Any) -> Prior:
+    """Return a prior with other parts; what was checked of it is not checked again."""
+    found = object.__new__(Prior)
+    for each in fields(Prior):
+        object.__setattr__(found, each.name, changed.get(each.name, getattr(prior, each.name)))
+    return found
 
 
 def state_in(motion: Motion, centre: Array) -> Array:
@@ -299,8 +314,8 @@ def pivot_of(covariance: Array) -> Array:
 def _information(covariance: Array) -> Array:
     """Return the information (18,18) of a covariance, zero for infinite variances."""
     known = np.flatnonzero(np.isfinite(np.diagonal(covariance)))
-    information = np.zeros((PARAMETERS, PARAMETERS))
-    information[np.ix_(known, known)] = np.linalg.inv(covariance[np.ix_(known, known)])
+    block, information = (known[:, None], known), np.zeros((PARAMETERS, PARAMETERS))
+    information[block] = np.linalg.inv(covariance[block])
     return information
 
 

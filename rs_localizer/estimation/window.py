@@ -88,6 +88,8 @@ _UNSHAKEN = np.eye(PARAMETERS, PARAMETERS + 3 * len(MIDDLE_VALUES))
 _UNSHAKEN[TURN, PARAMETERS:] = -np.kron(MIDDLE_VALUES, np.eye(3))
 _UNSHAKEN[ANGULAR, PARAMETERS:] = -np.kron(MIDDLE_RATES, np.eye(3))
 _ORIGIN = np.zeros(3)
+# Of the readout time in velocities and accelerations, by the places of a step.
+_POWERS = -np.repeat([0.0, 0.0, 1.0, 1.0, 2.0, 2.0], 3)
 
 
 class Gaussian(NamedTuple):
@@ -377,19 +379,21 @@ def _solve(
     )  # fmt: skip
 
 
-def _told_by_points(covariance: Array, known: Array) -> Array:
+@entry
+def _told_by_points(covariance: Array2, known: Array2) -> Array:
     """Return the information (18,18) of a posterior beyond its prior.
 
     By the eigenvalues of what was known, in units of the posterior: none of them exceeds 1.
     """
     whole = inverted(covariance)
-    scale = np.sqrt(np.diagonal(whole))
+    scale = np.sqrt(np.diag(whole))
     units = np.outer(scale, scale)
     factor = np.linalg.cholesky(whole / units)
     back = np.linalg.inv(factor)
     part = back @ (known / units) @ back.T
     values, vectors = np.linalg.eigh(0.5 * (part + part.T))
-    half = factor @ (vectors * np.sqrt(np.maximum(1.0 - values, 0.0)))
+    roots = np.ascontiguousarray(vectors * np.sqrt(np.maximum(1.0 - values, 0.0)))
+    half = np.ascontiguousarray(factor) @ roots
     told: Array = (half @ half.T) * units
     return told
 
@@ -401,6 +405,14 @@ def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array, Array]:
     somewhere else on it.
     """
     shake, joint = estimate.shake, estimate.joint_covariance
+    swing, jacobian = np.zeros((PARAMETERS, PARAMETERS)), _UNSHAKEN[:, : len(joint)]
+    if not len(shake) and len(joint) == PARAMETERS:
+        still = Motion(
+            estimate.rotation, estimate.translation, estimate.angular_velocity,
+            estimate.linear_velocity, angular_acceleration=estimate.angular_acceleration,
+            linear_acceleration=estimate.linear_acceleration,
+        )  # fmt: skip
+        return still, joint, swing, jacobian
     values, rates = MIDDLE_VALUES[: len(shake)], MIDDLE_RATES[: len(shake)]
     turned = so3.exp(values @ shake)
     still = Motion(
@@ -409,10 +421,9 @@ def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array, Array]:
         angular_acceleration=estimate.angular_acceleration,
         linear_acceleration=estimate.linear_acceleration,
     )  # fmt: skip
-    squares, swing = np.square(shake).sum(axis=1) / 3.0, np.zeros((PARAMETERS, PARAMETERS))
+    squares = np.square(shake).sum(axis=1) / 3.0
     swing[TURN, TURN] = (values**2 @ squares) * np.eye(3)
     swing[ANGULAR, ANGULAR] = (rates**2 @ squares) * np.eye(3)
-    jacobian = _UNSHAKEN[:, : len(joint)]
     covariance = jacobian @ joint @ jacobian.T
     # Pose and turn cancel: what rounding leaves of the difference of two large variances.
     return still, 0.5 * (covariance + covariance.T), swing, jacobian
@@ -420,7 +431,7 @@ def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array, Array]:
 
 def _per_second(span: float) -> Array:
     """Step (18,) per second of one per readout."""
-    units: Array = np.repeat(1.0 / span ** np.array([0, 0, 1, 1, 2, 2]), 3)
+    units: Array = span**_POWERS
     return units
 
 
@@ -536,10 +547,19 @@ def errors_ahead(window: MotionWindow, found: Estimate, swing: Array) -> Array:
     step = step_between(state_in(motion, _ORIGIN), state_in(found, _ORIGIN))
     claimed = covariance + swing
     second = found.joint_covariance[:PARAMETERS, :PARAMETERS] + np.outer(step, step)
-    parts = [slice(k, k + 3) for k in range(0, MOTION_PARAMETERS, 3)]
-    return np.array([
-        np.sum(inverted(claimed[part, part].copy()) * second[part, part]) / 3.0 for part in parts
-    ])  # fmt: skip
+    ratios: Array = _ratios(claimed, second)
+    return ratios
+
+
+@entry
+def _ratios(claimed: Array2, second: Array2) -> Array:
+    """Return second moments of steps over what was claimed (18,18), for each of four parts."""
+    ratios = np.empty(4)
+    for part in range(4):
+        first = 3 * part
+        known = inverted(claimed[first : first + 3, first : first + 3].copy())
+        ratios[part] = np.sum(known * second[first : first + 3, first : first + 3]) / 3.0
+    return ratios
 
 
 class PredictionErrors:
