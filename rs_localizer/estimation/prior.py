@@ -29,14 +29,11 @@ from rs_localizer.core.state import (
     ANGULAR_ACCELERATION,
     LINEAR,
     MOTION_PARAMETERS,
-    MOVE,
     PARAMETERS,
-    POSE,
     STATE_ANGULAR,
     STATE_SIZE,
-    TURN,
 )
-from rs_localizer.native import entry, inlined
+from rs_localizer.native import entry, inlined, kernel
 from rs_localizer.solvers.table import Solver
 
 if TYPE_CHECKING:  # which needs this module
@@ -284,38 +281,71 @@ def with_motion(
     """
     if prior.motion is None or not knows_motion(prior):
         return terms
-    covariance = np.asarray(prior.covariance, np.float64)
-    informations = np.concatenate([terms.informations, _information(covariance)[None]])
+    covariance = np.ascontiguousarray(prior.covariance, np.float64)
+    found: PriorTerms = _with_motion(terms, covariance, state_in(prior.motion, centre), turn_known)
+    return found
+
+
+@kernel
+def _turning(i: int) -> int:
+    """Place in a step of the turn rate, and of its change six places behind it."""
+    place: int = 6 + i + i // 3 * 3
+    return place
+
+
+@entry
+def _with_motion(
+    terms: PriorTerms, covariance: Array2, reference: Array1, turn_known: bool
+) -> PriorTerms:
+    informations, references, count = terms.informations, terms.references, len(terms.informations)
+    found = np.empty((count + 1, PARAMETERS, PARAMETERS))
+    of = np.empty((count + 1, STATE_SIZE))
+    found[:count], of[:count] = informations, references
+    found[count], of[count] = _inverse(covariance), reference
     if len(covariance) == PARAMETERS:  # it knows the accelerations better than a default
-        informations[0, ACCELERATIONS] = 0.0
+        found[0, ACCELERATIONS] = 0.0
         if turn_known:
-            informations[0][_TURNING] = 0.0
-    return PriorTerms(
-        informations, np.vstack([terms.references, state_in(prior.motion, centre)]), terms.gravity,
-        np.vstack([terms.pivots, pivot_of(covariance)]),
-    )  # fmt: skip
+            for i in range(6):
+                for j in range(6):
+                    found[0, _turning(i), _turning(j)] = 0.0
+    pivots = np.zeros((count + 1, 3))
+    pivots[:count], pivots[count] = terms.pivots, pivot_of(covariance)
+    return PriorTerms(found, of, terms.gravity, pivots)
 
 
-def pivot_of(covariance: Array) -> Array:
+@entry
+def pivot_of(covariance: Array2) -> Array:
     """Return the point (3,), in camera axes, whose place in the view is known best.
 
     Who turns about it moves by its distance times the turn: that is the part of the move that goes
     with the turn. A camera that a measured position holds turns about itself.
     """
-    if not np.isfinite(covariance[POSE, POSE]).all():
-        return np.zeros(3)
-    turn, across = covariance[TURN, TURN], covariance[TURN, MOVE]
-    turned = (1.0 + _RIDGE) * np.trace(turn) * np.eye(3) - turn
-    crossed = across - across.T
-    pivot = np.linalg.solve(turned, np.array([crossed[1, 2], crossed[2, 0], crossed[0, 1]]))
-    return pivot if np.isfinite(pivot).all() else np.zeros(3)
+    turned, along = np.zeros((3, 3)), np.zeros(3)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        along[i] = covariance[j, 3 + k] - covariance[k, 3 + j]
+        for m in range(3):
+            turned[i, m] -= covariance[i, m]
+            turned[i, i] += (1.0 + _RIDGE) * covariance[m, m]
+    pivot = np.zeros(3)
+    if np.all(np.isfinite(covariance[:6, :6])):
+        pivot = np.linalg.inv(turned) @ along
+    return pivot if np.all(np.isfinite(pivot)) else np.zeros(3)
 
 
-def _information(covariance: Array) -> Array:
+@inlined
+def _inverse(covariance: Array) -> Array:
     """Return the information (18,18) of a covariance, zero for infinite variances."""
-    known = np.flatnonzero(np.isfinite(np.diagonal(covariance)))
-    block, information = (known[:, None], known), np.zeros((PARAMETERS, PARAMETERS))
-    information[block] = np.linalg.inv(covariance[block])
+    places = np.flatnonzero(np.isfinite(np.diag(covariance)))
+    known = len(places)
+    block, information = np.empty((known, known)), np.zeros((PARAMETERS, PARAMETERS))
+    for i in range(known):
+        for j in range(known):
+            block[i, j] = covariance[places[i], places[j]]
+    inverse = np.linalg.inv(block)
+    for i in range(known):
+        for j in range(known):
+            information[places[i], places[j]] = inverse[i, j]
     return information
 
 
