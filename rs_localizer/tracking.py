@@ -306,7 +306,7 @@ class Tracker:
         seconds = 1e-9 * (time_ns - nearest_ns)
         if abs(seconds) <= 0.5 * nearest.span:
             there = Estimate.at_time(nearest, seconds)
-        elif (turned := self._turned(time_ns, readings)) is not None:
+        elif time_ns > track.time_ns and (turned := self.turned(time_ns, readings)) is not None:
             there = turned
         else:
             motion = window.at(time_ns)
@@ -329,8 +329,11 @@ class Tracker:
             there.aid = self.aid.snapshot()
         return there
 
-    def _turned(self, time_ns: int, readings: Any) -> Estimate | None:
-        """Return the motion after the last frame, rotated by the aid; None without readings."""
+    def turned(self, time_ns: int, readings: Any) -> Estimate | None:
+        """Return the motion before or after the rows of the last frame, rotated by the aid.
+
+        None where no readings tell it.
+        """
         track = self._track
         if track is None or self.aid is None or not self.aid.agreed or not readings:
             return None
@@ -340,10 +343,10 @@ class Tracker:
         seen_ns = min(time_ns, last_ns)
         # The middle of a frame whose last row would be there.
         middle_ns = min(time_ns, last_ns - half_ns)
-        if middle_ns < track.time_ns or time_ns > last_ns + half_ns:
+        if middle_ns < track.time_ns <= time_ns or time_ns > last_ns + half_ns:
             return None
         last = track.estimate
-        if middle_ns > track.time_ns:
+        if middle_ns != track.time_ns:
             before = self._before(middle_ns)
             known = None if before is None else self.aid.ahead(readings, middle_ns, before)
             if known is None:
@@ -663,15 +666,21 @@ class Tracker:
         return Acceleration(_LEAST_ACCELERATION, linear)
 
     def _before(self, time_ns: int) -> LastFrame | None:
-        """Return what the last frame knows of the motion beside the rotation that an aid reads."""
+        """Return what the last frame knows of the motion beside the rotation that an aid reads.
+
+        Before that frame the motion runs backwards: velocities are opposite, accelerations are not.
+        """
         track = self._track
         if track is None:
             return None
         readout_time = self._readout_time
         motion, dt = track.estimate, 1e-9 * (time_ns - track.time_ns)
         covariance = motion.joint_covariance[:PARAMETERS, :PARAMETERS]
-        added = acceleration_covariance(self._beside_aid(track), dt, readout_time)
-        return LastFrame(track.time_ns, motion, covariance, added, FADING / readout_time)
+        added = acceleration_covariance(self._beside_aid(track), abs(dt), readout_time)
+        added[VELOCITIES] *= math.copysign(1.0, dt)
+        added[:, VELOCITIES] *= math.copysign(1.0, dt)
+        fading = math.copysign(FADING, dt) / readout_time
+        return LastFrame(track.time_ns, motion, covariance, added, fading)
 
 
 def _check_motion(localizer: Localizer) -> None:

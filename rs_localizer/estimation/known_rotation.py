@@ -124,13 +124,13 @@ def turn_of(estimate: Estimate) -> Array:
 
 
 class LastFrame(NamedTuple):
-    """The last frame with a pose, for a prediction."""
+    """The last frame with a pose, for a prediction or a look back."""
 
     middle_ns: int
     motion: Motion
     covariance: Array  # (18,18)
     added: Array  # (18,18) that the prediction gets, but for the rotation
-    fading: float  # of accelerations, in readouts
+    fading: float  # of accelerations, in readouts; negative: before the frame
 
 
 class Foretold(Protocol):

@@ -206,11 +206,12 @@ def read(
     Args:
         middle_ns: exposure of the middle row.
         readout_time: s.
-        since_ns: of the middle row of the last frame.
+        since_ns: of the middle row of the last frame, before or after.
     """
     here_ns, half = middle_ns - round(1e9 * errors.time_offset), 0.5 * readout_time
     length = 0.0 if since_ns is None else 1e-9 * (middle_ns - since_ns)
-    span = samples.around(here_ns - round(1e9 * max(length, half)), here_ns + round(1e9 * half))
+    first_ns, last_ns = (round(1e9 * end) for end in (-max(length, half), max(-length, half)))
+    span = samples.around(here_ns + first_ns, here_ns + last_ns)
     if span is None:
         return None
     deviation = math.hypot(math.sqrt(errors.covariance[DELAY, DELAY].item()), _LEAST_SHIFT)
@@ -250,14 +251,14 @@ def read(
     by_errors[WITHIN] += np.einsum("pg,gxe->pxe", _PARTS, within).reshape(-1, PARAMETERS)
     rest[WITHIN, WITHIN] += _noise(errors.noise**2 * readout_time)
     between = None
-    if length > 0.0:
+    if length != 0.0:
         between = np.ascontiguousarray(turns[-1].T)
         angle = so3.log(np.ascontiguousarray(turns[-1]))
         # A constant rate in the camera's axes of each moment, seen in those of then.
         by_rate = length * so3.right_jacobian(angle)
         by_errors[BETWEEN] += by_rate @ errors.derivatives(angle / length)[0]
         mean[BETWEEN] = angle
-        rest[BETWEEN, BETWEEN] += errors.noise**2 * length * np.eye(3)
+        rest[BETWEEN, BETWEEN] += errors.noise**2 * abs(length) * np.eye(3)
     squares = np.square(mean).reshape(-1, 3).sum(axis=1)
     rest[np.diag_indices(len(rest))] += _SKEW**2 * np.repeat(squares, 3)
     rest += _JITTER**2 * np.outer(by_errors[:, DELAY.start], by_errors[:, DELAY.start])

@@ -16,6 +16,7 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice, Reason
+from rs_localizer.core.shake import within_rows
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.clouds import (
@@ -30,7 +31,7 @@ from rs_localizer.pipeline import what_fits
 from rs_localizer.pipeline.aid import Moment, aid_of
 from rs_localizer.pipeline.cloud_checks import stale_landmarks
 from rs_localizer.pipeline.frames import FrameLocalizer, is_timed
-from rs_localizer.pipeline.pose_at_time import middle_row_ns, published_moment
+from rs_localizer.pipeline.pose_at_time import PublishedMoment, middle_row_ns, published_moment
 from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
 from rs_localizer.tracking import FrameContext, Tracker
 
@@ -51,7 +52,7 @@ class CameraFrames(FrameLocalizer):
 
     def _forget_frames(self) -> None:
         # Of the last frames, by time of the middle row: with what their results are published.
-        self._waiting: dict[int, Correspondences] = {}
+        self._waiting: dict[int, tuple[Correspondences, PublishedMoment]] = {}
         # The newest of them that has a pose, without its rows.
         self._newest: Correspondences | None = None
         self._faults: set[str] = set()  # of the shutter, which have been noticed
@@ -146,10 +147,14 @@ class CameraFrames(FrameLocalizer):
         cloud = self._checked(cloud)
         time_ns, context = self._middle_row_ns(cloud.stamp_ns), self._context
         self._expect(time_ns, cloud.frame)
+        moment = published_moment(self._config, self._camera, cloud.stamp_ns)
 
         def localized(samples: Any) -> Estimate | Failure:
-            matches = cloud.points, cloud.pixels, cloud.scores
-            return self._tracker.localize(time_ns, *matches, readings=samples, context=context)
+            nonlocal moment
+            matches, tracker = (cloud.points, cloud.pixels, cloud.scores), self._tracker
+            result = tracker.localize(time_ns, *matches, readings=samples, context=context)
+            moment = self._turned(moment, samples)
+            return result
 
         self.aid.track(self._moment(time_ns), localized)
         result = self._tracker.newest
@@ -161,11 +166,11 @@ class CameraFrames(FrameLocalizer):
             if self.predicts:
                 self._newest = replace(cloud, table=cloud.table[:0], dropped=0)
         if self._tracker.output_lag > 0:
-            self._waiting[time_ns] = cloud
+            self._waiting[time_ns] = cloud, moment
             while len(self._waiting) > self._tracker.output_lag + 1:
                 del self._waiting[next(iter(self._waiting))]
         self._report_shutter()
-        published = self._published(cloud, result)
+        published = self._published(cloud, result, moment)
         if self._tracker.repeats and result:
             self._notice(
                 Notice.STILL_IMAGE,
@@ -194,7 +199,17 @@ class CameraFrames(FrameLocalizer):
             self._faults.add(shutter.kind)
             self._notice(Notice.READOUT_TIME, shutter.fault)
 
-    def _published(self, cloud: Correspondences, result: Estimate | Failure) -> Localized | Refusal:
+    def _turned(self, moment: PublishedMoment, samples: Any) -> PublishedMoment:
+        """Return the moment of the newest frame with its motion, if no row shows that."""
+        newest = self._tracker.newest
+        shown = moment.tau == within_rows(moment.tau) or self._tracker.repeats
+        if shown or not newest or not newest.aided:
+            return moment
+        return moment._replace(motion=self._tracker.turned(moment.stamp_ns, samples))
+
+    def _published(
+        self, cloud: Correspondences, result: Estimate | Failure, moment: PublishedMoment
+    ) -> Localized | Refusal:
         """Return a result of the body at the published moment."""
         if not result:
             return Refusal(result.reason, result.detail)
@@ -207,11 +222,10 @@ class CameraFrames(FrameLocalizer):
             self._notice(Notice.DOUBTFUL, result.left_out)
         if self._tracker.lens.fault:
             self._notice(Notice.LENS, self._tracker.lens.fault)
-        moment = published_moment(self._config, self._camera, cloud.stamp_ns)
         return self._mounted_result(cloud, result, moment)
 
     def _mounted_result(
-        self, cloud: Correspondences, estimate: Estimate, moment: tuple[int, float]
+        self, cloud: Correspondences, estimate: Estimate, moment: PublishedMoment
     ) -> Localized | Refusal:
         deviation = self._tracker.readout_time_deviation(self._context)
         return self.mounted(self._camera_result(cloud, estimate, moment, deviation))
@@ -232,7 +246,8 @@ class CameraFrames(FrameLocalizer):
         """Return the result of a frame that has waited."""
         if not found:
             return Refusal(found.reason, found.detail)
-        return self._published(self._waiting[found.time_ns], found)
+        cloud, moment = self._waiting[found.time_ns]
+        return self._published(cloud, found, moment)
 
     def flush(self) -> list[Localized | Refusal]:
         """Return the results of frames that still wait for others: none will come."""
@@ -264,4 +279,4 @@ class CameraFrames(FrameLocalizer):
         if found is None:
             return None
         cloud = replace(self._newest, stamp_ns=stamp_ns)
-        return self._mounted_result(cloud, found, (stamp_ns, 0.0))
+        return self._mounted_result(cloud, found, PublishedMoment(stamp_ns, 0.0))

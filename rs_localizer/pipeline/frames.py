@@ -36,6 +36,7 @@ from rs_localizer.pipeline.aid import AidInput, without_aid, without_wait
 from rs_localizer.pipeline.cloud_checks import oddities
 from rs_localizer.pipeline.given_pose import GivenPose, PosePrior
 from rs_localizer.pipeline.keypoint_map import Landmarks, read_landmarks
+from rs_localizer.pipeline.pose_at_time import PublishedMoment
 from rs_localizer.pipeline.published import ReadoutKnown, of_body, of_camera
 from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
 from rs_localizer.pipeline.stream import Stream
@@ -253,7 +254,7 @@ class FrameLocalizer(ABC):
             self._forget_motion()
 
     def _camera_result(
-        self, cloud: Correspondences, estimate: Estimate, moment: tuple[int, float],
+        self, cloud: Correspondences, estimate: Estimate, moment: PublishedMoment,
         readout_deviation: float = 0.0,
     ) -> Localized:  # fmt: skip
         """Return the pose and twist of the first camera at a moment, as of :func:`.of_camera`."""

@@ -26,6 +26,7 @@ stand behind the motion in the estimate's covariance, and its rotation and rate 
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -92,11 +93,19 @@ def middle_row_ns(config: NodeConfig, camera: Camera, stamp_ns: int) -> int:
     return stamp_ns + round(delay * 1e9)
 
 
-def published_moment(config: NodeConfig, camera: Camera, stamp_ns: int) -> tuple[int, float]:
-    """Return the stamp of the published pose, and the row time of that moment."""
+class PublishedMoment(NamedTuple):
+    """The moment of a published pose."""
+
+    stamp_ns: int
+    tau: float  # row time
+    motion: Estimate | None = None  # there, if readings tell it; None: that of the frame
+
+
+def published_moment(config: NodeConfig, camera: Camera, stamp_ns: int) -> PublishedMoment:
+    """Return the moment of the published pose of a frame."""
     if config.pose_time == PoseTime.MID_FRAME:
-        return middle_row_ns(config, camera, stamp_ns), 0.0
+        return PublishedMoment(middle_row_ns(config, camera, stamp_ns), 0.0)
     tau = camera.first_row_time
     if config.readout_time > 0.0:
         tau -= config.stamp_offset / config.readout_time
-    return stamp_ns, tau
+    return PublishedMoment(stamp_ns, tau)

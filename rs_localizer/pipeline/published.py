@@ -30,7 +30,7 @@ from rs_localizer.io.outputs import BodyPose, Localized, Twist
 from rs_localizer.io.transforms import NotYetError, Transform, TransformError, Transforms
 from rs_localizer.pipeline.carried_pose import FoundPose, Odometry
 from rs_localizer.pipeline.map_to_odom import CorrectionState, Settings, decide
-from rs_localizer.pipeline.pose_at_time import pose_at, twist_at, with_timing
+from rs_localizer.pipeline.pose_at_time import PublishedMoment, pose_at, twist_at, with_timing
 from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.solvers.table import find_solver
 
@@ -121,22 +121,22 @@ def of_camera(
     estimate: Estimate,
     config: NodeConfig,
     frame: str,
-    moment: tuple[int, float],
+    moment: PublishedMoment,
     readout: ReadoutKnown,
 ) -> Localized:
     """Return pose and twist of the optical frame of the (first) camera at a moment.
 
     Args:
         cloud: with the rows of the estimate, or with none.
-        moment: its stamp and row time.
     """
     readout_time = estimate.span
-    stamp_ns, tau = moment
+    stamp_ns, tau, there = moment
     moving = readout_time > 0.0 and find_solver(config.solver).rolling_shutter
     if readout.global_shutter and not estimate.aided:
         moving = False  # an image says nothing of velocities
-    pose = pose_at(estimate, tau)
-    twist = twist_at(estimate, tau, readout_time) if moving else None
+    motion, at = (estimate, tau) if there is None else (there, 0.0)
+    pose = pose_at(motion, at)
+    twist = twist_at(motion, at, readout_time) if moving else None
     deviation = readout.deviation
     if twist is not None and deviation > 0.0:
         # The middle row comes later where the readout takes longer; the first one does not.

@@ -38,6 +38,7 @@ from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline import what_fits
 from rs_localizer.pipeline.frames import FrameLocalizer, is_timed
 from rs_localizer.pipeline.inputs import INPUTS
+from rs_localizer.pipeline.pose_at_time import PublishedMoment
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unheard
 from rs_localizer.tracking import FrameContext, Tracker
 
@@ -358,6 +359,7 @@ class RigFrames(FrameLocalizer):
         config, first = self._config, images[0].cloud
         time_ns = origin_ns + round(1e9 * result.time)
         stamp_ns = time_ns if config.pose_time == PoseTime.MID_FRAME else first.stamp_ns
-        moment = stamp_ns, (stamp_ns - time_ns) / (1e9 * result.span)  # exact for a camera alone
+        tau = (stamp_ns - time_ns) / (1e9 * result.span)  # exact for a camera alone
+        moment = PublishedMoment(stamp_ns, tau)
         made = self._camera_result(joined(config.cameras, images), result, moment)
         return replace(made, cameras=tuple(share_of(image, result) for image in images))
