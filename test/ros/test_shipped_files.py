@@ -21,7 +21,7 @@ from rclpy.context import Context
 from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.recording import PARAMETERS
-from rs_localizer.io.topics import DEBUG_IMAGE, LIVE, MAP_MARKERS
+from rs_localizer.io.topics import DEBUG_IMAGE, LIVE, MAP_MARKERS, MAP_TO_ODOM
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.prints import Chessboard
@@ -294,6 +294,10 @@ def test_nav2_manages_the_node():
     manager = yaml.safe_load(file.read_text())["/**/lifecycle_manager_localization"]
     assert NODE_NAME in manager["ros__parameters"]["node_names"]
     assert manager["ros__parameters"]["bond_timeout"] == 4.0  # nav2's default
+    condition = (ROOT / "examples" / "nav2_is_localized.cpp").read_text()
+    topic = f"/{NODE_NAME}/{MAP_TO_ODOM}"
+    assert f'InputPort<std::string>("topic", "{topic}"' in condition
+    assert topic.lstrip("/") in SENT
 
 
 def test_robot_localization_listens_to_what_the_node_publishes():
