@@ -453,14 +453,15 @@ class Tracker:
         Returns:
             what was found, and both priors that it was found with.
         """
-        alone = self._prior(time_ns, None, span, context)
         if foreseen is None or self.aid is None:
+            alone = self._prior(time_ns, None, span, context)
             return find(alone, None), alone, None
         rotation = foreseen.rotation
         prior = foreseen.prior or self._prior(time_ns, rotation, span, context)
         found = find(prior, rotation)
         if found and self.aid.agrees(foreseen, found, self._told(found, prior, foreseen)):
             return found, prior, rotation
+        alone = self._prior(time_ns, None, span, context)
         other = find(alone, None)
         if other and not found:
             self.aid.agrees(foreseen, other, self._told(other, alone, foreseen))

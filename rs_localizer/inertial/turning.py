@@ -230,7 +230,7 @@ def read(
     _, rates = turns_at(np.clip(moments, dense[0], dense[-1]).ravel(), dense, cubics, knots)
     rates = readout_time * rates.reshape(*moments.shape, 3)
     slopes, rates = (rates[:, -2] - rates[:, -1]) / readout_time, rates[:, :-2]
-    late = np.einsum("pg,dgx->dpx", _PARTS, rates).reshape(len(delays), -1)
+    late = (_PARTS @ rates).reshape(len(delays), -1)
     # From the last frame to this one, beside a constant.
     steps = 0.5 * (slopes[1:] + slopes[:-1]) * np.diff(delays)[:, None]
     turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
@@ -245,10 +245,9 @@ def read(
         cubics = spline(dense, found)
         knots = rotations_at_knots(dense, cubics)
     turns, _ = turns_at(np.append(readout_time * NODES, -length), dense, cubics, knots)
-    within = readout_time * errors.derivatives(
-        np.einsum("d,dgx->gx", weights, rates) / readout_time
-    )
-    by_errors[WITHIN] += np.einsum("pg,gxe->pxe", _PARTS, within).reshape(-1, PARAMETERS)
+    usual = (weights @ rates.reshape(len(delays), -1)).reshape(-1, 3)
+    within = readout_time * errors.derivatives(usual / readout_time)
+    by_errors[WITHIN] += (_PARTS @ within.reshape(len(usual), -1)).reshape(-1, PARAMETERS)
     rest[WITHIN, WITHIN] += _noise(errors.noise**2 * readout_time)
     between = None
     if length != 0.0:
