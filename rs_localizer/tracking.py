@@ -41,6 +41,7 @@ from rs_localizer.core.state import (
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.estimation.known_rotation import Aid, Foretold, LastFrame
+from rs_localizer.estimation.moved_part import MovedPart
 from rs_localizer.estimation.prior import Prior, beside, unchecked
 from rs_localizer.estimation.window import (
     FADING,
@@ -165,7 +166,9 @@ class Tracker:
         self.repeats = False  # whether the last frame shows an image that had come before
         self._track: _Track | None = None
         self._given: tuple[int, Prior] | None = None
-        self._integrity = Integrity()
+        rig = localizer.rig
+        alone = rig.exposure().ahead() if len(rig.cameras) == 1 else None
+        self._integrity = Integrity(alone, localizer.config.map_deviation)
         self._errors = PredictionErrors(max_prediction)
         self._last_ns: int | None = None
         self._too_close = 0
@@ -195,6 +198,11 @@ class Tracker:
     def stale(self, points: ArrayLike) -> BoolArray:
         """Return a mask of landmarks (n,3) of a single camera, often seen and never matched."""
         return self._integrity.stale(points)
+
+    @property
+    def moved(self) -> MovedPart | None:
+        """The part of the map that frames of a single camera show elsewhere; None: none."""
+        return self._integrity.moved
 
     def mount(self, rig: Rig) -> None:
         """Set new mounts of the same cameras; the rig's axes stay the same."""
@@ -441,6 +449,9 @@ class Tracker:
         self._keep(_Seen(time_ns, result, points, pixels, stamps))
         self._images.add(time_ns, points, pixels)
         self._publish()
+        newest = self._seen[-1].found
+        if result and newest and pixels is not None:  # of a camera alone
+            self._integrity.look(newest, np.asarray(points), np.asarray(pixels))
         return self.delayed
 
     def _fitted(

@@ -29,7 +29,7 @@ from rs_localizer.io.outputs import Localized
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline import what_fits
 from rs_localizer.pipeline.aid import Moment, aid_of
-from rs_localizer.pipeline.cloud_checks import stale_landmarks
+from rs_localizer.pipeline.cloud_checks import moved_landmarks, stale_landmarks
 from rs_localizer.pipeline.frames import FrameLocalizer, is_timed
 from rs_localizer.pipeline.pose_at_time import PublishedMoment, middle_row_ns, published_moment
 from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
@@ -216,8 +216,10 @@ class CameraFrames(FrameLocalizer):
         if result.integrity > DOUBTFUL:
             text = f"pose or map are wrong with a probability of {result.integrity:.0%}"
             self._notice(Notice.DOUBTFUL, text)
-        elif said := stale_landmarks(cloud, self._tracker.stale(cloud.points)):
-            self._notice(Notice.STALE_LANDMARKS, said)
+        else:
+            gone = stale_landmarks(cloud, self._tracker.stale(cloud.points))
+            for said in filter(None, (gone, moved_landmarks(cloud, self._tracker.moved))):
+                self._notice(Notice.STALE_LANDMARKS, said)
         if result.left_out:
             self._notice(Notice.DOUBTFUL, result.left_out)
         if self._tracker.lens.fault:

@@ -8,6 +8,7 @@ from rs_localizer.core.arrays import BoolArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import centre_of, off_centre
 from rs_localizer.core.reasons import Notice
+from rs_localizer.estimation.moved_part import MovedPart
 from rs_localizer.io.clouds import Correspondences
 
 # Coordinates in single precision shall tell millimetres, in m: they do as far as 8 km.
@@ -65,12 +66,33 @@ def stale_landmarks(cloud: Correspondences, gone: BoolArray) -> str:
     """Name the points that are gone from a map in a sentence; empty if there are none."""
     if not gone.any():
         return ""
-    rows = np.flatnonzero(gone)
+    count, listed = _names(cloud, gone)
+    return f"{count} landmarks in view are often seen and never matched: {listed}"
+
+
+def moved_landmarks(cloud: Correspondences, part: MovedPart | None) -> str:
+    """Name the points of a part of the map that was moved; empty if none is in view."""
+    if part is None:
+        return ""
+    own = {tuple(point) for point in part.points.tolist()}
+    moved = np.array([tuple(point) in own for point in cloud.points.tolist()], np.bool_)
+    if not moved.any():
+        return ""
+    count, listed = _names(cloud, moved)
+    way = 1e3 * float(np.linalg.norm(part.way))
+    return (
+        f"{count} landmarks in view lie together {way:.2g} mm from where the map has them, seen "
+        f"from the others, or the others do: {listed}"
+    )
+
+
+def _names(cloud: Correspondences, some: BoolArray) -> tuple[int, str]:
+    """Return how many landmarks some points are, and the first of their names."""
+    rows = np.flatnonzero(some)
     if "id" in (cloud.table.dtype.names or ()):
         names = [str(name) for name in np.unique(cloud.table["id"][rows])]
     else:
         names = [
             f"({x:.2f}, {y:.2f}, {z:.2f})" for x, y, z in np.unique(cloud.points[rows], axis=0)
         ]
-    listed = ", ".join(names[:_NAMED]) + (" ..." if len(names) > _NAMED else "")
-    return f"{len(names)} landmarks in view are often seen and never matched: {listed}"
+    return len(names), ", ".join(names[:_NAMED]) + (" ..." if len(names) > _NAMED else "")
