@@ -63,7 +63,7 @@ class LensWatch:
         if len(self._sizes) < _FRAMES:
             return
         off, declared = np.median(self._sizes, axis=0)
-        allowed = max(_BEYOND * declared, self._least)
+        allowed = self._allowed(declared)
         self.fault = (
             f"residuals vary smoothly over the image ({off:.2g} px rms), more than the deviations "
             f"of calibration and map allow ({allowed:.2g} px): is the image of another mode or "
@@ -72,3 +72,11 @@ class LensWatch:
             if off > allowed
             else ""
         )
+
+    def is_beyond(self, found: Estimate) -> bool:
+        """Return whether one frame's smooth error is beyond what is declared."""
+        return found.model_error > self._allowed(found.declared_error)
+
+    def _allowed(self, declared: float) -> float:
+        """Return the largest smooth error (px, rms) that deviations allow."""
+        return max(_BEYOND * declared, self._least)

@@ -450,7 +450,7 @@ class Tracker:
         self._images.add(time_ns, points, pixels)
         self._publish()
         newest = self._seen[-1].found
-        if result and newest and pixels is not None:  # of a camera alone
+        if result and newest and pixels is not None and self.lens.is_beyond(newest):
             self._integrity.look(newest, np.asarray(points), np.asarray(pixels))
         return self.delayed
 
