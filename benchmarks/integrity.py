@@ -46,7 +46,6 @@ CAMERA = Camera(640, 480, K, readout_time=0.03)
 FRAMES, RATE, SQUARES = 15, 15.0, 260
 OUTSIDE = 22.46  # chi-squared of six numbers, 99.9 %
 BASE = 0.02  # share of wrong frames for which it is calibrated
-MOST_ERROR = 0.03  # of the calibration, on the sequences of the fit
 BINS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 0.7, 1.0)
 
 
@@ -222,43 +221,33 @@ def fit(rows: list[Row]) -> None:
     innovations, jumped = _jumps(rows)
     jump = _regression(innovations[:, None], jumped, 0.002, 0.0)
     integrity.JUMP = (float(jump[0]), float(jump[1]))
-    is_wrong, best = np.array([row.wrong for row in rows]), (False, 0, 0.0, 0.0, 0.0)
-    constant = float(integrity.WEIGHTS[0])
-    for more, temper, recovers in itertools.product(
-        (1.0, 1.25, 1.5), (0.35, 0.4, 0.45, 0.5), (0.3, 0.4, 0.5)
-    ):
-        integrity.WEIGHTS[0] = constant + more
-        integrity.TEMPER, integrity.RECOVERS = temper, recovers
-        said = recursive(rows)
-        good = calibration(said, is_wrong)[0] < MOST_ERROR
-        best = max(best, (good, int(np.sum(said[is_wrong] > 0.5)), more, temper, recovers))
-    _, _, more, integrity.TEMPER, integrity.RECOVERS = best
-    integrity.WEIGHTS[0] = constant + more
+    best: tuple[float, ...] = (np.inf,)
+    wrong = np.array([row.wrong for row in rows])
+    share = weights_of(wrong)
+    for temper, goes, recovers in itertools.product((0.1, 0.2, 0.4), (1e-4, 1e-3), (0.02, 0.1)):
+        integrity.TEMPER, integrity.GOES_WRONG, integrity.RECOVERS = temper, goes, recovers
+        said = np.clip(recursive(rows), 1e-6, 1.0 - 1e-6)
+        cost = float(np.mean(share * -np.log(np.where(wrong, said, 1.0 - said))))
+        best = min(best, (cost, temper, goes, recovers))
+    _, integrity.TEMPER, integrity.GOES_WRONG, integrity.RECOVERS = best
     print("WEIGHTS", np.round(integrity.WEIGHTS, 3).tolist(), "JUMP", np.round(jump, 2).tolist())
-    print("TEMPER, RECOVERS", best[3:])
-
-
-def calibration(said: Array, wrong: Array) -> tuple[float, list[str]]:
-    """Return the expected calibration error, and what was said and found by bins."""
-    share, error, lines = weights_of(wrong), 0.0, []
-    for low, high in itertools.pairwise(BINS):
-        here = (said >= low) & (said < high)
-        if here.any():
-            pair = [np.average(each[here], weights=share[here]) for each in (said, wrong)]
-            error += abs(pair[0] - pair[1]) * share[here].sum() / share.sum()
-            lines.append(
-                f"  {low:5.3f} to {high:5.3f}: {here.sum():5} frames, said {pair[0]:.4f}, "
-                f"found {pair[1]:.4f}"
-            )
-    return error, lines
+    print("TEMPER, GOES_WRONG, RECOVERS", best[1:])
 
 
 def report(rows: list[Row]) -> None:
     """Reliability, ROC and detection, as text."""
     said, wrong = recursive(rows), np.array([row.wrong for row in rows])
-    error, lines = calibration(said, wrong)
-    print(f"{len(rows)} frames, {wrong.sum()} wrong, weighted to {BASE:.0%}", *lines, sep="\n")
-    print(f"expected calibration error {error:.4f}")
+    share = weights_of(wrong)
+    print(f"{len(rows)} frames, {wrong.sum()} wrong, weighted to {BASE:.0%}")
+    errors = 0.0
+    for low, high in itertools.pairwise(BINS):
+        here = (said >= low) & (said < high)
+        if here.any():
+            pair = [np.average(each[here], weights=share[here]) for each in (said, wrong)]
+            errors += abs(pair[0] - pair[1]) * share[here].sum() / share.sum()
+            print(f"  {low:5.3f} to {high:5.3f}: {here.sum():5} frames, said {pair[0]:.4f}, "
+                  f"found {pair[1]:.4f}")  # fmt: skip
+    print(f"expected calibration error {errors:.4f}")
     order = np.argsort(-said)
     hits, alarms = np.cumsum(wrong[order]) / wrong.sum(), np.cumsum(~wrong[order]) / (~wrong).sum()
     print(f"area below the ROC {np.trapezoid(hits, alarms):.3f}")

@@ -30,19 +30,20 @@ from rs_localizer.estimation.moved_part import Look, MovedPart, chosen, look_at,
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.native import entry
 
-NAMES = ("apart", "persists", "spread", "filled", "count", "innovation")
+NAMES = (
+    "share", "together", "apart", "persists", "spread", "filled", "count", "innovation",
+)  # fmt: skip
 """Names of the numbers of a frame."""
 # The regression: the constant, then the weights of NAMES; an innovation counts as a jump only.
-WEIGHTS = np.array([1.267, 0.426, -0.083, -3.532, 0.453, -0.374, 0.0])
+WEIGHTS = np.array([1.363, -0.855, 0.011, 0.365, 0.845, -4.351, -0.551, -0.653, 0.0])
 # Weight of a frame's log odds beside those of earlier frames; probabilities per frame that a right
 # track goes wrong and that a wrong one recovers; probabilities that a first pose is wrong in either
 # way. A right scene in the middle of the image, with a fifth of its matches wrong, reaches 0.02
 # after ten seconds; with weights that are fitted to single poses it reached 0.78.
-TEMPER, GOES_WRONG, RECOVERS, FIRST = 0.5, 0.001, 0.5, (0.015, 0.005)
+TEMPER, GOES_WRONG, RECOVERS, FIRST = 0.4, 0.001, 0.3, (0.015, 0.005)
 # Log odds that an innovation is a jump to a wrong or a right pose (constant and factor), and the
-# highest probability that a jump may give: more likely wrong than right, and no more, because a map
-# of which a part is right has jumps to right poses.
-JUMP, MOST_JUMP = (-16.57, 5.58), 0.52
+# highest probability that a jump may give.
+JUMP, MOST_JUMP = (-15.57, 5.34), 0.65
 INNOVATION = NAMES.index("innovation")
 # Neighbours of a point in the map that are compared with it; most points that are compared.
 _NEIGHBOURS, _MOST = 4, 200
@@ -192,7 +193,7 @@ class Integrity:
     def numbers(
         self, estimate: Estimate, points: ArrayLike, pixels: ArrayLike, prior: Prior | None
     ) -> Array:
-        """Return the numbers (6,) of the next frame, in the order of ``NAMES``.
+        """Return the numbers (8,) of the next frame, in the order of ``NAMES``.
 
         Args:
             estimate: of the frame.
@@ -204,13 +205,17 @@ class Integrity:
         every, seen = np.asarray(points, float)[usable], np.asarray(pixels, float)[usable]
         kept, residuals = np.asarray(estimate.inliers)[usable], residuals[usable]
         inliers = int(kept.sum())
+        share = math.log((inliers + 1.0) / (len(kept) - inliers + 1.0))
         own = residuals[kept]
         filled = float(np.mean(own > 0.5 * max(own.max(), 1e-9))) if inliers else 1.0
-        outliers = (len(kept) - inliers + 1.0) / (len(kept) + 2.0)
+        together, persists = _together(every, kept), self._persists(every, kept)
+        outliers = 1.0 / (1.0 + math.exp(share))
         return np.array(
             [
-                _together(every, kept) * outliers,  # less, if few cluster: a person in view
-                self._persists(every, kept),
+                share,
+                together,
+                together * outliers,  # less, if few cluster: a person in view
+                persists,
                 _spread(seen[kept], seen),
                 filled,
                 math.log(max(inliers - 6.0, 1.0)),

@@ -2,15 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The chance of a wrong pose or map rises by what only those leave, and falls again."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import rs_localizer as rsl
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.integrity import Integrity, SeenLandmarks
 
+EXAMPLES = Path(__file__).parents[1] / "examples"
 RNG = np.random.default_rng(0)
 POINTS = RNG.uniform([-3.0, -3.0, 3.0], [3.0, 3.0, 9.0], (120, 3))
 PIXELS = 400.0 * POINTS[:, :2] / POINTS[:, 2:] + [320.0, 240.0]
@@ -98,3 +101,24 @@ def test_a_landmark_that_has_been_matched_once_is_there():
     for i in range(100):
         seen.add(keys, (keys > 1) | ((keys == 0) & (i == 50)))
     assert np.flatnonzero(seen.stale(keys)).tolist() == [1]
+
+
+def test_a_right_scene_in_the_middle_of_the_image_is_not_doubted(monkeypatch):
+    """A fifth of the matches is wrong: the scene of the examples, which users start with."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    from moving_camera import HEIGHT, READOUT, WIDTH, K, Moving, matches, scene
+
+    camera = rsl.Camera(
+        width=WIDTH, height=HEIGHT, K=K, D=np.zeros(5), distortion_model="plumb_bob",
+        readout_time=READOUT, scan_direction="top_to_bottom",
+    )  # fmt: skip
+    tracker, moving, points = (
+        rsl.Tracker(rsl.Localizer(camera)),
+        Moving((0.1, -0.2, 0.0)),
+        scene(150),
+    )
+    doubts = []
+    for k in range(300):
+        found, seen = matches(moving, points, k / 30.0, seed=k)
+        doubts.append(tracker.localize(10**9 + k * 33_333_333, found, seen).integrity)
+    assert max(doubts) < 0.05

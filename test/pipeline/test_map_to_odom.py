@@ -178,7 +178,7 @@ def test_another_pose_now_and_then_does_not_end_a_contradiction(other):
     assert drive.worst < 5.0
 
 
-@pytest.mark.parametrize(("doubt", "moved"), [(0.51, True), (0.53, False)])
+@pytest.mark.parametrize(("doubt", "moved"), [(0.64, True), (0.66, False)])
 def test_a_jump_that_a_body_can_have_made_is_no_ground_for_doubt(doubt, moved):
     drive = tracking()
     drive.carry(1.0, 1.0, poses=False)
