@@ -240,7 +240,7 @@ class Integrity:
         return float(np.log(counts[0, 0] * counts[1, 1] / (counts[0, 1] * counts[1, 0])))
 
     def add(self, numbers: Array) -> float:
-        """Return the probability that the pose is wrong, after a frame with these numbers (6,)."""
+        """Return the probability that the pose is wrong, after a frame with these numbers (8,)."""
         said = min(max(float(WEIGHTS[0] + WEIGHTS[1:] @ numbers), -_MOST_ODDS), _MOST_ODDS)
         if not self._is_first:
             self._chances = _transitions(float(numbers[INNOVATION])) @ self._chances

@@ -1,10 +1,10 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The rotation within a frame as something other than its points knows it: a mean, a covariance.
+"""The rotation within a frame as a gyroscope measures it: a mean and a covariance.
 
 The mean is taken out of the points, row by row (:func:`compensated`), so that all that follows sees
-a camera that hardly turns. What it may be off by stands beside that: a rate, its change, and the
-coefficients of an in-frame turn (:mod:`rs_localizer.estimation.known_rotation`).
+a camera that hardly turns. The errors of the mean are unknowns of the fit: a rate, its change, and
+the coefficients of an in-frame turn (:mod:`rs_localizer.estimation.known_rotation`).
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class RotationPrior:
     def joined(self, rate: Array, change: Array, shake: Array) -> tuple[Array, Array, Array]:
         """Return rate, change and coefficients of the rotation with another one beside it.
 
-        To first order in each other: what is beside it is small.
+        It is right to first order, because the other rotation is small.
         """
         beside = shake if len(shake) else np.zeros_like(self.shake)
         return self.rate + rate, self.change + change, self.shake + beside
