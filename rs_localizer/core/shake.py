@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""In-frame rotation: vibration of the camera beside its motion of constant acceleration.
+"""The in-frame rotation: how a camera vibrates while it moves with constant acceleration.
 
 The rotation vector (rad) is a sum of cosines and sines of the row time ``tau`` (-0.5 to 0.5). Their
 frequencies are fixed, half a cycle per readout apart. With Gaussian coefficients the sum is a

@@ -140,7 +140,7 @@ class Foretold(Protocol):
     def rotation(self) -> RotationPrior: ...
     @property
     def prior(self) -> Prior | None:
-        """Of the motion beside the rotation; None: nothing follows from before."""
+        """The prior of the motion without the rotation; None: no earlier frame tells of it."""
 
     def of(self, last: Estimate) -> Estimate:
         """Return the estimate that it makes of the last frame's."""

@@ -57,9 +57,9 @@ class ManagedNode(SettingsNode[Config], Generic[Config, Result]):
         self.worker: Worker[Result] | None = None  # from configuring to cleaning up
         self._inputs: Inputs | None = None
         self.opened = contextlib.ExitStack()
-        """What is undone when the node is cleaned up."""
+        """The stack of calls that undo ``configure``; ``cleanup`` closes it."""
         self.active = contextlib.ExitStack()
-        """What is undone when the node is deactivated."""
+        """The stack of calls that undo ``activate``; ``deactivate`` closes it."""
         super().__init__(self.node_name, self.kind, **options)
         self.autostart: bool = self.config.autostart
         self.refusals = Refusals(self.warn)
