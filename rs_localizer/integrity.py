@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
+from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray, IntArray
 from rs_localizer.core.rig import Exposure
 from rs_localizer.core.state import TURN
 from rs_localizer.core.types import Estimate
@@ -110,35 +110,56 @@ def _keys(points: Array) -> Array:
 
 
 class SeenLandmarks:
-    """How often landmarks were seen, and how often they were matched."""
+    """How often landmarks were seen and matched, and whether in the last frame."""
 
     def __init__(self) -> None:
         self._keys = np.zeros(0)  # sorted
-        self._counts = np.zeros((0, 2))  # seen, kept
+        # Seen, kept; the last frame with it, and whether it was kept there.
+        self._counts = np.zeros((0, 4))
+        self._frame = 0
 
-    def add(self, keys: Array, kept: BoolArray) -> None:
-        """Count the landmarks of a frame."""
-        new, first = np.unique(keys, return_index=True)
-        known = np.union1d(self._keys, new)
-        counts = np.zeros((len(known), 2))
-        counts[np.searchsorted(known, self._keys)] = self._counts
-        place = np.searchsorted(known, new)
-        counts[place] += np.stack([np.ones(len(new)), kept[first]], axis=1)
-        if len(known) > _MOST_LANDMARKS:  # those that are not in view
-            keep = np.isin(known, new)
-            known, counts = known[keep], counts[keep]
-        self._keys, self._counts = known, counts
+    def skip(self) -> None:
+        """Let the next frame follow no other."""
+        self._frame += 1
+
+    def add(self, keys: Array, kept: BoolArray) -> Array:
+        """Count the landmarks of a frame.
+
+        Returns:
+            how many (2,2) of them were outliers or inliers in the last frame, and are now.
+        """
+        keys, first = np.unique(keys, return_index=True)
+        kept, known = kept[first], self._places(keys)[1]
+        if not known.all():
+            where = self._keys.searchsorted(keys[~known])
+            self._keys = np.insert(self._keys, where, keys[~known])
+            self._counts = np.insert(self._counts, where, (0.0, 0.0, -1.0, 0.0), axis=0)
+        place, _ = self._places(keys)
+        seen, often, frame, before = self._counts[place].T
+        follows = frame == self._frame
+        pairs = 2 * before[follows].astype(np.int64) + kept[follows]
+        self._frame += 1
+        last = np.full(len(keys), float(self._frame))
+        self._counts[place] = np.column_stack([seen + 1.0, often + kept, last, kept])
+        if len(self._keys) > _MOST_LANDMARKS:  # those that are not in view
+            self._keys, self._counts = keys, self._counts[place]
+        return np.bincount(pairs, minlength=4).reshape(2, 2)
 
     def stale(self, keys: Array) -> BoolArray:
         """Return which landmarks, by key, were seen too often to be unmatched by chance."""
-        if not len(self._keys):
-            return np.zeros(len(keys), np.bool_)
-        seen, kept = self._counts.T
-        missed = 1.0 - kept.sum() / seen.sum()
-        never = (kept == 0) & (missed**seen < _BY_CHANCE)
-        place = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
-        found: BoolArray = never[place] & (self._keys[place] == keys)
+        place, found = self._places(keys)
+        if found.any():
+            seen, kept = self._counts[:, :2].T
+            missed = 1.0 - kept.sum() / seen.sum()
+            found &= ((kept == 0) & (missed**seen < _BY_CHANCE))[place]
         return found
+
+    def _places(self, keys: Array) -> tuple[IntArray, BoolArray]:
+        """Return where landmarks are, by key, and which are known."""
+        if not len(self._keys):
+            return np.zeros(len(keys), np.int64), np.zeros(len(keys), np.bool_)
+        place = np.minimum(self._keys.searchsorted(keys), len(self._keys) - 1)
+        return place, self._keys[place] == keys
 
 
 class Integrity:
@@ -159,8 +180,7 @@ class Integrity:
         # Probabilities of the three states after the last frame.
         self._chances = np.array([1.0 - sum(FIRST), *FIRST])
         self._is_first = True
-        # Keys of the last frame's landmarks, in their order, and whether they were inliers
-        self._kept = np.zeros(0), np.zeros(0, np.bool_)
+        self._seen.skip()
         self.moved: MovedPart | None = None
         """The part of the map that was last found to lie elsewhere; None: no part was."""
         self._looks: list[Look] = []
@@ -228,15 +248,7 @@ class Integrity:
 
         Chance mismatches differ from frame to frame; a landmark that was moved stays an outlier.
         """
-        keys = _keys(points)
-        self._seen.add(keys, kept)
-        order = np.argsort(keys)
-        (before, was_kept), self._kept = self._kept, (keys[order], kept[order])
-        counts = np.ones((2, 2))  # before, now
-        if len(before):
-            place = np.minimum(np.searchsorted(before, keys), len(before) - 1)
-            same = before[place] == keys
-            np.add.at(counts, (was_kept[place[same]].astype(int), kept[same].astype(int)), 1.0)
+        counts = 1.0 + self._seen.add(_keys(points), kept)
         return float(np.log(counts[0, 0] * counts[1, 1] / (counts[0, 1] * counts[1, 0])))
 
     def add(self, numbers: Array) -> float:
