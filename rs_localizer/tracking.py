@@ -33,8 +33,6 @@ from rs_localizer.core.rotation_prior import RotationPrior
 from rs_localizer.core.state import (
     ANGULAR,
     PARAMETERS,
-    STATE_ANGULAR,
-    STATE_ANGULAR_ACCELERATION,
     TURN,
     VELOCITIES,
 )
@@ -49,13 +47,10 @@ from rs_localizer.estimation.window import (
     Gaussian,
     MotionSample,
     MotionWindow,
-    PredictionErrors,
     acceleration_covariance,
     estimate_at,
     gaussian_of,
-    motion_of,
     predicted_estimate,
-    sample_of,
     told_of,
     unshaken,
 )
@@ -107,6 +102,7 @@ class _Track:
     time_ns: int
     share: float  # of inliers among the points
     window: MotionWindow
+    swing: Array  # (18,18) covariance of the shaking about the window's motion, per readout
     vibrations: Array  # (s,f) logarithms of the odds of each vibration, by all frames
 
 
@@ -169,7 +165,6 @@ class Tracker:
         rig = localizer.rig
         alone = rig.exposure().ahead() if len(rig.cameras) == 1 else None
         self._integrity = Integrity(alone, localizer.config.map_deviation)
-        self._errors = PredictionErrors(max_prediction)
         self._last_ns: int | None = None
         self._too_close = 0
         if aid is not None:
@@ -180,7 +175,6 @@ class Tracker:
         """Forget all frames so far."""
         self._track = self._given = None
         self._integrity.reset()
-        self._errors.reset()
         self._seen.clear()
         self._images, self.repeats = RepeatedImages(), False
         self.shutter.reset()
@@ -279,9 +273,9 @@ class Tracker:
         own = track.estimate.span
         share = self.readout_time_deviation(context) / own
         window = replace(track.window, readout_share=share)
-        motion, covariance = motion_of(window.after(time_ns), own if span is None else span)
+        motion, covariance = window.after(time_ns).per_readout(own if span is None else span)
         try:
-            return Prior(motion=motion, covariance=covariance + unshaken(track.estimate)[2])
+            return Prior(motion=motion, covariance=covariance + track.swing)
         except ValueError:  # rounding errors are all that is left of the covariance
             return None
 
@@ -289,10 +283,9 @@ class Tracker:
         """Return the motion at a time, in ns as :meth:`localize` takes it.
 
         Within the rows of one of the last frames it is the motion of that frame. Between frames it
-        comes from the frames before and after. After them it is predicted, and its covariance is as
-        wide as recent predictions were wrong. Before the last frames, more than ``max_prediction``
-        after them, or if the orientation is too uncertain, it is None. Points are those of the
-        nearest frame.
+        comes from the frames before and after. After them it is predicted. Before the last frames,
+        more than ``max_prediction`` after them, or if the orientation is too uncertain, it is None.
+        Points are those of the nearest frame.
 
         Args:
             time_ns: the time, ns.
@@ -302,7 +295,6 @@ class Tracker:
         track = self._track
         if track is None:
             return None
-        window, swing = track.window, unshaken(track.estimate)[2]
         # Of frames that failed since there may be more than are kept.
         frames = [*((seen.time_ns, seen.found) for seen in self._seen if seen.found)]
         frames.append((track.time_ns, track.estimate))
@@ -317,12 +309,10 @@ class Tracker:
         elif time_ns > track.time_ns and (turned := self.turned(time_ns, readings)) is not None:
             there = turned
         else:
-            motion = window.at(time_ns)
+            motion = track.window.at(time_ns)
             if motion is None:
                 return None
-            there = predicted_estimate(nearest, motion, swing)
-            if (ahead := 1e-9 * (time_ns - track.time_ns)) > 0.0:
-                there = self._errors.widened(there, ahead)
+            there = predicted_estimate(nearest, motion, track.swing)
         there = replace(there, time_ns=time_ns)
         if isinstance(there, RigEstimate):
             there = replace(there, time=there.time + seconds)
@@ -332,7 +322,7 @@ class Tracker:
         """Return a copy for :meth:`at` in another thread, while frames are localized here."""
         there = copy(self)
         there._seen = deque(map(copy, self._seen), LENGTH)
-        there._track, there._errors = copy(self._track), copy(self._errors)
+        there._track = copy(self._track)
         if self.aid is not None:
             there.aid = self.aid.snapshot()
         return there
@@ -435,7 +425,7 @@ class Tracker:
         foreseen = None
         if self.aid is not None:
             foreseen = self.aid.foresee(readings, time_ns, self._before(time_ns))
-        result, prior, rotation = self._fitted(time_ns, foreseen, span, context, find)
+        result, prior, told = self._fitted(time_ns, foreseen, span, context, find)
         if pixels is not None:  # of a camera alone
             jumped = self._has_jumped(time_ns, prior, result)
             seen = np.asarray(points, float), np.asarray(pixels, float)
@@ -445,7 +435,7 @@ class Tracker:
             result = self.shutter.widened(self._judged(result, points, pixels, prior))
             if self.remembers_motion:
                 result = self._covering(replace(result, time_ns=time_ns), context)
-                self._remember(time_ns, prior, rotation, result, context)
+                self._remember(time_ns, told, result, context)
         self._keep(_Seen(time_ns, result, points, pixels, stamps))
         self._images.add(time_ns, points, pixels)
         self._publish()
@@ -458,37 +448,44 @@ class Tracker:
         self, time_ns: int, foreseen: Foretold | None, span: float | None,
         context: FrameContext,
         find: Callable[[Prior | None, RotationPrior | None], Estimate | Failure],
-    ) -> tuple[Estimate | Failure, Prior | None, RotationPrior | None]:  # fmt: skip
+    ) -> tuple[Estimate | Failure, Prior | None, MotionSample | None]:  # fmt: skip
         """Find the frame beside what the aid knows, or without what its points contradict.
 
         Returns:
-            what was found, and both priors that it was found with.
+            what was found, the prior that it was found with, and what its points tell.
         """
-        if foreseen is None or self.aid is None:
-            alone = self._prior(time_ns, None, span, context)
-            return find(alone, None), alone, None
-        rotation = foreseen.rotation
-        prior = foreseen.prior or self._prior(time_ns, rotation, span, context)
-        found = find(prior, rotation)
-        if found and self.aid.agrees(foreseen, found, self._told(found, prior, foreseen)):
-            return found, prior, rotation
+        found, prior, told = Failure(Reason.AWAITS_FRAMES, ""), None, None
+        if foreseen is not None and self.aid is not None:
+            rotation = foreseen.rotation
+            prior = foreseen.prior or self._prior(time_ns, rotation, span, context)
+            found = find(prior, rotation)
+            told = self._told(time_ns, found, prior, rotation)
+            if found and told and self.aid.agrees(foreseen, found, told):
+                return found, prior, told
         alone = self._prior(time_ns, None, span, context)
         other = find(alone, None)
-        if other and not found:
-            self.aid.agrees(foreseen, other, self._told(other, alone, foreseen))
-        return (other, alone, None) if other else (found, prior, rotation)
+        if foreseen is not None and not other:
+            return found, prior, told
+        known = self._told(time_ns, other, alone, None)
+        if foreseen is not None and self.aid is not None and not found and other and known:
+            self.aid.agrees(foreseen, other, known)
+        return other, alone, known
 
-    def _told(self, found: Estimate, prior: Prior | None, foreseen: Foretold) -> MotionSample:
-        """Return what the points of a frame tell of its motion beside the known rotation."""
-        near, rotation = prior if found.tracked else None, foreseen.rotation
-        if found.aided:
-            known = self.localizer.known_of(near, found.span, rotation)
-            return told_of(rotation.beside(found), known)
-        told = told_of(found, self.localizer.known_of(near, found.span))
-        state = told.state.copy()
-        state[STATE_ANGULAR] -= rotation.smooth_rate
-        state[STATE_ANGULAR_ACCELERATION] -= rotation.change
-        return told._replace(state=state)
+    def _told(
+        self, time_ns: int, found: Estimate | Failure, prior: Prior | None,
+        rotation: RotationPrior | None,
+    ) -> MotionSample | None:  # fmt: skip
+        """Return what the points of a frame tell of its motion beside what was known of it.
+
+        None if nobody asks for it, or if rounding errors are all that is left of a covariance.
+        """
+        if not found or not (self.remembers_motion or self.aid is not None):
+            return None
+        known = self.localizer.known_of(prior if found.tracked else None, found.span, rotation)
+        try:
+            return told_of(found, time_ns, known, rotation)
+        except np.linalg.LinAlgError:
+            return None
 
     def _keep(self, seen: _Seen) -> None:
         if self._seen and self._seen[-1].time_ns == seen.time_ns:  # the same frame, matched anew
@@ -534,7 +531,7 @@ class Tracker:
                 return known.prior
         if track is None or track.window is None:
             return self.prediction(time_ns)
-        motion, covariance = motion_of(track.window.newest, track.estimate.span)
+        motion, covariance = track.window.newest.per_readout(track.estimate.span)
         return coasting(motion, covariance, 1e-9 * (time_ns - track.time_ns) / track.estimate.span)
 
     @property
@@ -632,45 +629,33 @@ class Tracker:
         return replace(found, residuals=residuals, inliers=residuals <= seen.gate)
 
     def _remember(
-        self, time_ns: int, prior: Prior | None, rotation: RotationPrior | None,
-        result: Estimate, context: FrameContext,
-    ) -> None:  # fmt: skip
+        self, time_ns: int, told: MotionSample | None, result: Estimate, context: FrameContext
+    ) -> None:
         """Keep what the next frames are to know of this one."""
         track, share = self._track, float(np.mean(result.inliers))
         if track is not None and result.tracked:
             share = (1.0 - _NEWEST) * track.share + _NEWEST * share
-        window = self._window(time_ns, prior, rotation, result, track, context)
+        window, swing = self._window(time_ns, told, result, context), unshaken(result)[2]
         vibrations = result.vibrations
         if track is not None and track.vibrations.size:
             # Beside an aid they are of another kind: of what it leaves.
             is_new = vibrations.size and not result.aided
             vibrations = track.vibrations + (vibrations if is_new else 0.0)
-        self._track = _Track(result, time_ns, share, window, _REMEMBERED * vibrations)
-        self._errors.add(result, window, unshaken(result)[2])
+        self._track = _Track(result, time_ns, share, window, swing, _REMEMBERED * vibrations)
 
     def _window(
-        self, time_ns: int, prior: Prior | None, rotation: RotationPrior | None,
-        result: Estimate, track: _Track | None, context: FrameContext,
-    ) -> MotionWindow:  # fmt: skip
+        self, time_ns: int, told: MotionSample | None, result: Estimate, context: FrameContext
+    ) -> MotionWindow:
         """Return a window of the last frames and this one; if it denies them, of this one alone."""
-        share = self.readout_time_deviation(context) / result.span
+        track, share = self._track, self.readout_time_deviation(context) / result.span
+        if track is not None and told is not None and self._trusts_motion(context):
+            window = replace(track.window, readout_share=share).joined(told)
+            if window.surprise < _MOST_INNOVATION:  # NaN, of rounding errors, is not
+                return window
         alone = MotionWindow.begin(
             gaussian_of(result, time_ns), self.localizer.config.acceleration, share
         )
-        if track is None:
-            return alone
-        window = track.window
-        alone = replace(alone, deviations=window.deviations)
-        if not self._trusts_motion(context):
-            return alone
-        near = prior if result.tracked else None
-        try:
-            known = self.localizer.known_of(near, result.span, rotation)
-            sample = sample_of(result, time_ns, known, rotation)
-            window = replace(window, readout_share=share).joined(sample)
-        except np.linalg.LinAlgError:  # rounding errors are all that is left of a covariance
-            return alone
-        return window if window.surprise < _MOST_INNOVATION else alone  # NaN is neither
+        return alone if track is None else replace(alone, deviations=track.window.deviations)
 
     def _beside_aid(self, track: _Track) -> Acceleration:
         """Return the accelerations beside the rotation that an aid reads."""

@@ -35,6 +35,8 @@ from rs_localizer.core.state import (
     ANGULAR_ACCELERATION,
     LINEAR,
     PARAMETERS,
+    STATE_ANGULAR,
+    STATE_ANGULAR_ACCELERATION,
     TURN,
     step_between,
 )
@@ -301,8 +303,11 @@ class GyroscopeTrack:
 
         Args:
             found: the frame, with the gyroscope or without.
-            told: what points tell of the motion beside the known turn, per readout.
+            told: what its points tell of its motion.
         """
+        told = told.over(found.span)
+        told.state[STATE_ANGULAR] -= prediction.rotation.smooth_rate
+        told.state[STATE_ANGULAR_ACCELERATION] -= prediction.rotation.change
         foreseen = prediction.foreseen or self._of_rotation(prediction, told)
         motions = slice(0, PARAMETERS)
         spread, information = foreseen.covariance[motions, motions].copy(), told.information

@@ -10,16 +10,14 @@ import rs_localizer as rsl
 from rs_localizer.config import Acceleration
 from rs_localizer.core.state import step_between
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.prior import Prior, motion_terms, state_in, with_motion
+from rs_localizer.estimation.prior import Prior, motion_terms, with_motion
 from rs_localizer.estimation.robust import apply_step
 from rs_localizer.estimation.window import (
     LENGTH,
     Gaussian,
     MotionSample,
     MotionWindow,
-    errors_ahead,
-    motion_of,
-    sample_of,
+    told_of,
 )
 
 FADING, PERIOD = 0.03, 1.0 / 30.0  # s
@@ -217,7 +215,7 @@ def test_points_tell_what_the_posterior_knows_beside_its_prior():
     before = np.linalg.inv(spread)
     before[6:12, 6:12] += np.eye(6)  # the velocities of the settings
     posterior = np.linalg.inv(information + before)
-    sample = sample_of(estimate(posterior @ gradient, posterior), 7, known)
+    sample = told_of(estimate(posterior @ gradient, posterior), 7, known)
     scale = np.sqrt(np.diag(information + before))
     np.testing.assert_allclose(
         sample.information / np.outer(UNITS * scale, UNITS * scale),
@@ -228,23 +226,3 @@ def test_points_tell_what_the_posterior_knows_beside_its_prior():
     np.testing.assert_allclose(
         sample.gradient / UNITS / scale, left / scale, atol=1e-2 * np.abs(left / scale).max()
     )
-
-
-def test_errors_ahead_are_squared_steps_over_what_was_claimed():
-    random = np.random.default_rng(3)
-    start = Gaussian(0, apply_step(STILL, SMALL * random.normal(size=18)), WIDE)
-    window = MotionWindow.begin(start, Acceleration(10.0, 4.0), readout_share=0.01)
-    later = motion_of(window.after(40_000_000), SPAN)
-    spread = random.normal(size=(18, 18)) * SMALL
-    joint, swing = spread @ spread.T, np.diag(np.linspace(1e-9, 1e-7, 18))
-    state = apply_step(state_in(later[0], np.zeros(3)), SMALL * random.normal(size=18))
-    found = Estimate(
-        state[:9].reshape(3, 3), state[9:12], state[12:15], state[15:18], np.ones(0, bool),
-        np.zeros(0), joint, 0, time_ns=40_000_000, span=SPAN,
-    )  # fmt: skip
-    step, claimed = step_between(state_in(later[0], np.zeros(3)), state), later[1] + swing
-    expected = []
-    for own in (slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)):
-        second = joint[own, own] + np.outer(step[own], step[own])
-        expected.append(np.trace(np.linalg.solve(claimed[own, own], second)) / 3.0)
-    np.testing.assert_allclose(errors_ahead(window, found, swing), expected, rtol=1e-9)
