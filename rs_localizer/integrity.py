@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray, IntArray
+from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
 from rs_localizer.core.rig import Exposure
 from rs_localizer.core.state import TURN
 from rs_localizer.core.types import Estimate
@@ -113,10 +113,10 @@ class SeenLandmarks:
     """How often landmarks were seen and matched, and whether in the last frame."""
 
     def __init__(self) -> None:
-        self._keys = np.zeros(0)  # sorted
+        self._rows: dict[float, int] = {}  # of landmarks, by key
         # Seen, kept; the last frame with it, and whether it was kept there.
         self._counts = np.zeros((0, 4))
-        self._frame = 0
+        self._frame = 1
 
     def skip(self) -> None:
         """Let the next frame follow no other."""
@@ -128,38 +128,32 @@ class SeenLandmarks:
         Returns:
             how many (2,2) of them were outliers or inliers in the last frame, and are now.
         """
-        keys, first = np.unique(keys, return_index=True)
-        kept, known = kept[first], self._places(keys)[1]
-        if not known.all():
-            where = self._keys.searchsorted(keys[~known])
-            self._keys = np.insert(self._keys, where, keys[~known])
-            self._counts = np.insert(self._counts, where, (0.0, 0.0, -1.0, 0.0), axis=0)
-        place, _ = self._places(keys)
+        rows, known = self._rows, len(self._counts)
+        place = np.array([rows.setdefault(key, len(rows)) for key in keys.tolist()], np.int64)
+        if len(rows) > known:
+            more = max(len(rows) - known, known)
+            self._counts = np.concatenate([self._counts, np.zeros((more, 4))])
         seen, often, frame, before = self._counts[place].T
         follows = frame == self._frame
         pairs = 2 * before[follows].astype(np.int64) + kept[follows]
         self._frame += 1
         last = np.full(len(keys), float(self._frame))
         self._counts[place] = np.column_stack([seen + 1.0, often + kept, last, kept])
-        if len(self._keys) > _MOST_LANDMARKS:  # those that are not in view
-            self._keys, self._counts = keys, self._counts[place]
+        if len(rows) > _MOST_LANDMARKS:  # those that are not in view
+            there = dict.fromkeys(keys.tolist())
+            self._counts = self._counts[[rows[key] for key in there]]
+            self._rows = {key: row for row, key in enumerate(there)}
         return np.bincount(pairs, minlength=4).reshape(2, 2)
 
     def stale(self, keys: Array) -> BoolArray:
         """Return which landmarks, by key, were seen too often to be unmatched by chance."""
-        place, found = self._places(keys)
+        place = np.array([self._rows.get(key, -1) for key in keys.tolist()], np.int64)
+        found: BoolArray = place >= 0
         if found.any():
             seen, kept = self._counts[:, :2].T
             missed = 1.0 - kept.sum() / seen.sum()
             found &= ((kept == 0) & (missed**seen < _BY_CHANCE))[place]
         return found
-
-    def _places(self, keys: Array) -> tuple[IntArray, BoolArray]:
-        """Return where landmarks are, by key, and which are known."""
-        if not len(self._keys):
-            return np.zeros(len(keys), np.int64), np.zeros(len(keys), np.bool_)
-        place = np.minimum(self._keys.searchsorted(keys), len(self._keys) - 1)
-        return place, self._keys[place] == keys
 
 
 class Integrity:
