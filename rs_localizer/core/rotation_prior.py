@@ -34,6 +34,7 @@ ROTATION = np.r_[ANGULAR, ANGULAR_ACCELERATION, PARAMETERS:WHOLE]
 
 NODES = np.linspace(-0.52, 0.52, 53)
 """Row times at which rotations are compared."""
+_VALUES = np.ascontiguousarray(shake_functions(NODES)[0])
 # rad of a rotation that is rounding.
 _RIDGE = 1e-7
 # Image points that nearly keep pace with the rows.
@@ -44,7 +45,7 @@ _LEAST_FRONT = 1e-3
 
 def _parts_by_turns() -> Array:
     """Return the derivatives (30,n) of rate, change and coefficients by turns at the nodes."""
-    shown = np.column_stack([NODES, 0.5 * NODES**2, shake_functions(NODES)[0]])
+    shown = np.column_stack([NODES, 0.5 * NODES**2, _VALUES])
     sizes = np.repeat(TYPICAL_SIZES, 2)
     scale = np.r_[1.0, 1.0, sizes]  # as little vibration as can be
     left, sizes, right = np.linalg.svd(shown * scale, full_matrices=False)
@@ -114,9 +115,11 @@ def parts_of(rotations: Array) -> tuple[Array, Array, Array]:
 def _parts_of(rotations: Array3) -> Array:
     parts, off = np.zeros((2 + FUNCTIONS, 3)), np.empty((len(rotations), 3))
     for _ in range(3):  # Gauss-Newton; rotations are small
-        here, _ = _turned(NODES, parts[0].copy(), parts[1].copy(), parts[2:].copy())
+        swings = _VALUES @ parts[2:].copy()
         for i in range(len(rotations)):
-            off[i] = so3.log(np.ascontiguousarray(here[i] @ rotations[i].T))
+            angle = NODES[i] * parts[0] + 0.5 * NODES[i] * NODES[i] * parts[1]
+            here = so3.exp(-swings[i]) @ so3.exp(-angle)
+            off[i] = so3.log(np.ascontiguousarray(here @ rotations[i].T))
         parts += _PARTS @ off
     return parts
 
