@@ -47,14 +47,8 @@ _LEAST_CHANCE = -math.log(1e-3)
 _LEAST_ODDS = 4.0
 # Beyond so many gates a point is another's.
 _ELSEWHERE = 2.0
-# How much the errors of two neighbours may differ, as a part of their distance: scales are off by
-# twice at most.
-_STRETCH = 0.5
-_MANY = 60
 # Gates before a declared map, of two motions, differ by less, and a widened one from both by more.
 _WIDE = 1.2
-# This part of mismatches at most is off as its neighbours are: by chance two in a hundred are.
-_STREWN = 0.1
 # A side of the image that has all but this part of a group.
 _ELSE = 0.1
 # Focal lengths, in parts of K's, from which another matrix is looked for: between two of them a
@@ -123,7 +117,6 @@ def left_out(
         known: the motion was predicted, so that the camera's matrix is right, and a group as large
             is another thing.
     """
-    least = 1.0 if known else _LEAST_ODDS
     inliers = posterior.inliers
     rest = ~(posterior.squared_errors < (_ELSEWHERE * WIDEST_GATE * posterior.gate) ** 2)
     found, left = int(np.count_nonzero(inliers)), int(np.count_nonzero(rest))
@@ -131,19 +124,13 @@ def left_out(
     failure = None if known else _by_chance(observed, posterior, wide)
     if failure is not None:
         return LeftOut(failure, _rough(observed, posterior) if wide else "")
-    if not (wide or np.count_nonzero(~inliers) >= _SAMPLE):
-        most = _BENT_OFF_CENTRE if _is_off_centre(observed) else _BENT
-        bent = posterior.model_error > most * promised(posterior)
-        if known or not bent or not observed.sighted.exposure.alone:
-            return LeftOut()
-        return LeftOut(_of_another_lens(search, observed, posterior, None, threshold))
-    strewn = not wide and _moved_alike(observed, posterior, ~inliers) < _STREWN
-    second = None
-    if left > _SAMPLE and (not strewn or _odds(found, left, posterior.speeding) < least):
-        second = _own_motion(search, observed, rest, threshold)
-    if strewn and second is None:
-        return LeftOut()
-    if not known and observed.sighted.exposure.alone:
+    most = _BENT_OFF_CENTRE if _is_off_centre(observed) else _BENT
+    bent = posterior.model_error > most * promised(posterior)
+    bent |= posterior.noise > EXPECTED_NOISE * threshold
+    second = _own_motion(search, observed, rest, threshold) if left > _SAMPLE else None
+    # Before K errors hang together: some of them over the image, or those of a second group.
+    alone = observed.sighted.exposure.alone
+    if not known and alone and (bent or second is not None):
         failure = _of_another_lens(search, observed, posterior, second, threshold)
         if failure is not None:
             return LeftOut(failure)
@@ -160,7 +147,7 @@ def left_out(
         f"their own, {math.degrees(turn):.1f} deg and {move:.2g} m away"
     )
     faster = max(posterior.speeding - speeding(observed, second.state), 0.0)
-    if _odds(found, size, faster) > least:
+    if _odds(found, size, faster) > (1.0 if known else _LEAST_ODDS):
         return LeftOut(notice=f"{text}: have these points been moved, or do they move?")
     return LeftOut(Failure(
         Reason.MODEL_ERROR,
@@ -376,28 +363,6 @@ def _step(observed: Observed, state: Array, lens: Array, known: _Known, gate: fl
     slope[PARAMETERS:] += of_lens @ (lens - known.mean)
     step, positive = solve_positive(information, -slope)
     return step if positive else np.full(PARAMETERS + _LENS, np.nan)
-
-
-def _moved_alike(observed: Observed, posterior: Posterior, rest: BoolArray) -> float:
-    """Return the share of left-out points whose errors resemble those of their neighbours.
-
-    It costs a tenth of a search, and mismatches seldom are.
-    """
-    count = observed.observations.count
-    lines = linearized(
-        observed.observations.packed, count, posterior.state, np.zeros((count, 6))
-    )  # fmt: skip
-    some = np.flatnonzero(rest & np.isfinite(lines.errors[:, 0]))
-    some = some[:: len(some) // _MANY + 1]
-    focal = observed.assumed.focal_length
-    if len(some) < 2:
-        return 0.0
-    places, errors = focal * observed.observations.rays[some], lines.errors[some]
-    apart = np.linalg.norm(places[:, None] - places, axis=2)
-    np.fill_diagonal(apart, math.inf)
-    off = np.linalg.norm(errors - errors[apart.argmin(axis=1)], axis=1)
-    alike = off < GLOBAL_SHUTTER_SCALE * focal + _STRETCH * apart.min(axis=1)
-    return float(np.mean(alike))
 
 
 def _surprise(total: int, size: int, sample: int, chance: float) -> float:
