@@ -195,9 +195,6 @@ class LocalizerConfig:
     solver: str = setting(
         "r6p_vcwt", "Minimal solver that generates the hypotheses", choices=tuple(SOLVERS)
     )
-    solver_iterations: int = setting(
-        5, "Most iterations of an iterative solver; it stops when it converges", (1, 100)
-    )
     refinement: str = setting(
         RefinementKind.FULL,
         "What follows the search; none: nothing, the model of the best sample is published without "
@@ -216,18 +213,7 @@ class LocalizerConfig:
         "most 384",
         (1, 1_000_000),
     )
-    confidence: float = setting(
-        0.99,
-        "The search stops when a sample without outliers has been drawn with this probability",
-        (0.0, 0.999999),
-    )
     min_inliers: int = setting(8, "Fewest inliers of an accepted pose", (7, 1_000_000))
-    max_orientation_deviation: float = setting(
-        0.07,
-        "Largest accepted standard deviation of the orientation about its worst axis, in rad; if "
-        "only unknown motion causes the uncertainty, up to three times this is accepted",
-        (0.001, 10.0),
-    )
     seed: int = setting(0, "Seed of the random samples; every frame starts from it", (0, 2**31 - 1))
     velocity_prior: VelocityPrior = field(default_factory=VelocityPrior)
     acceleration: Acceleration = field(default_factory=Acceleration)
@@ -321,9 +307,6 @@ class Imu:
     gyroscope_noise: float = setting(
         2e-4, "Noise density of the gyroscope, in rad/s/sqrt(Hz)", (1e-7, 1.0)
     )
-    gyroscope_bias_walk: float = setting(
-        1e-4, "Random walk of the gyroscope's bias, in rad/s^2/sqrt(Hz)", (0.0, 1.0)
-    )
     gravity: bool = setting(
         False, "Use the direction of gravity that the accelerometer shows; needs gravity_in_map"
     )
@@ -336,21 +319,6 @@ class Imu:
 
     def __post_init__(self) -> None:
         check(self, "imu.")
-
-
-@dataclass(frozen=True, slots=True)
-class RigSettings:
-    """How the images of several cameras become frames."""
-
-    window: float = setting(
-        0.02,
-        "Images of several cameras form one frame if the middles of their exposures lie within "
-        "this time, in s; cameras without a common trigger need half their period",
-        (0.0, 1.0),
-    )
-
-    def __post_init__(self) -> None:
-        check(self, "rig.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -489,7 +457,6 @@ class NodeConfig(LocalizerConfig):
         "stamp_offset below its name; without names there is one camera",
         read_only=True,
     )
-    rig: RigSettings = field(default_factory=RigSettings)
     gravity_in_map: tuple[float, ...] = setting(
         (0.0, 0.0, -1.0), "Direction in which things fall in the map, of any length: imu.gravity"
     )

@@ -200,7 +200,7 @@ class Localizer:
         """Return the estimate, or a :class:`Failure` if its orientation is too uncertain."""
         if not found or self.config.refinement == RefinementKind.NONE:
             return found
-        failure = uncertain(found, self.config.max_orientation_deviation)
+        failure = uncertain(found)
         return found if failure is None else failure
 
     def find(

@@ -13,6 +13,7 @@ from benchmarks.frames.conditions import named
 from benchmarks.frames.judged import far_off, judge
 from rs_localizer.core.rig import Mounts, Rig
 from rs_localizer.core.shutter import project_rolling
+from rs_localizer.estimation import acceptance
 from rs_localizer.estimation.hypotheses import Posterior
 from rs_localizer.estimation.points import Observations
 from rs_localizer.estimation.prior import assumptions, state_in
@@ -102,10 +103,12 @@ def test_the_best_motion_is_the_minimum_of_the_exact_problem(tilt, turn, travel)
 @pytest.fixture(scope="module")
 def small_planes():
     """Planes of 0.2 m, 2 to 3 m away, that lean by 20 deg: noise hides which way they lean."""
-    localizer = rsl.Localizer(CAMERA, max_orientation_deviation=1.0)
+    localizer = rsl.Localizer(CAMERA)
     frames = [plane_frame(seed, 20.0, 0.0, 0.0, 0.1) for seed in range(60)]
-    return [(localizer.localize(points, pixels), points, pixels, true)
-            for points, pixels, true in frames]  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(acceptance, "MOST_TURN", 1.0)
+        return [(localizer.localize(points, pixels), points, pixels, true)
+                for points, pixels, true in frames]  # fmt: skip
 
 
 def test_a_mirrored_pose_is_never_published(small_planes):
@@ -133,16 +136,18 @@ def test_a_prediction_says_which_of_both_poses_it_is(small_planes):
     assert helped > 5
 
 
-def test_a_track_begins_with_an_orientation_that_is_not_published():
+def test_a_track_begins_with_an_orientation_that_is_not_published(monkeypatch):
     """Every frame adds what it knows, although the first ones know too little to be published."""
     camera = rsl.Camera(1000, 1000, CAMERA.K, readout_time=0.03)
     points, _, motion = plane_frame(3, 30.0, 0.0, 0.0, 0.3)
     exact, _ = project_rolling(camera, motion.at_rows, points)
     rng = np.random.default_rng(3)
     frames = [exact + rng.normal(size=exact.shape) for _ in range(12)]
-    alone = rsl.Localizer(camera, max_orientation_deviation=1.0).localize(points, frames[0])
+    monkeypatch.setattr(acceptance, "MOST_TURN", 1.0)
+    alone = rsl.Localizer(camera).localize(points, frames[0])
     most = alone.orientation_deviation / 3.2
-    tracker = rsl.Tracker(rsl.Localizer(camera, max_orientation_deviation=most))
+    monkeypatch.setattr(acceptance, "MOST_TURN", most)
+    tracker = rsl.Tracker(rsl.Localizer(camera))
     results = [
         tracker.localize(33_333_333 * (1 + k), points, frame) for k, frame in enumerate(frames)
     ]
@@ -154,7 +159,7 @@ def test_a_track_begins_with_an_orientation_that_is_not_published():
 
 def test_tracked_plane_does_not_lock_in_on_a_lean():
     # Frames in a row agree on a lean that noise made: 59 % were inside, 5 % beyond five sigma. Half
-    # of them know it to less than max_orientation_deviation.
+    # of them know it well enough to be published.
     judged = judge(named("locks/0.2m/tilt 0/1px"), 60, 3, {})
     assert judged.localized.mean() > 0.35
     assert judged.inside("pose").mean() > 0.85

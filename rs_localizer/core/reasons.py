@@ -53,7 +53,7 @@ class Reason(_Explained):
         "is K, its binning or region of interest that of these images?",
     )
     UNCERTAIN = (
-        "uncertain", "orientation deviation above max_orientation_deviation",
+        "uncertain", "orientation known to worse than 4 degrees",
         "come nearer, show more of the map",
     )
     SCAN_AXIS = (

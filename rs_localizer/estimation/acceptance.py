@@ -37,6 +37,8 @@ from rs_localizer.estimation.points import Observed
 _MOST_NOISE, _MOST_NOISE_GLOBAL_SHUTTER = 0.75, 1.0
 # Smooth errors may be so many times what is declared: of printed boards, nine (benchmarks.real).
 _MOST_DECLARED = math.exp(3.5)
+# Largest standard deviation of the orientation, rad: 4 degrees are 7 cm at a metre.
+MOST_TURN = 0.07
 # An orientation that is open because the camera may move is accepted up to so many times the limit:
 # hand-held boards of 12 to 20 cm come to 1.5 times (benchmarks.real), and beyond three a covariance
 # no longer says where a pose on an arc may be.
@@ -122,16 +124,13 @@ def speeding(observed: Observed, state: Array) -> float:
     return float(velocities @ observed.terms.informations[0][part, part] @ velocities)
 
 
-def uncertain(estimate: Estimate, most: float) -> Failure | None:
+def uncertain(estimate: Estimate) -> Failure | None:
     """Return why an estimate is too uncertain to be published, or None.
 
     What points do not tell because the camera may move, its covariance says: a global-shutter
     estimator, which takes the camera for one at rest, would publish that pose.
-
-    Args:
-        most: largest standard deviation of the orientation, rad.
     """
-    deviation, still = estimate.orientation_deviation, estimate.still_deviation
+    deviation, still, most = estimate.orientation_deviation, estimate.still_deviation, MOST_TURN
     if deviation <= most or (still <= most and deviation <= _OPEN * most):
         return None
     return Failure(

@@ -59,7 +59,7 @@ def before_a_plane(seed):
 @pytest.mark.parametrize("frames", [10, pytest.param(40, marks=pytest.mark.bench)])
 def test_a_fast_camera_before_a_plane_that_faces_it_is_found(frames):
     """From the global-shutter pose, which leans, one in four was not, after all the samples."""
-    localizer = Localizer(CAMERA, max_orientation_deviation=0.1)
+    localizer = Localizer(CAMERA)
     for seed in range(frames):
         estimate = localizer.localize(*before_a_plane(seed))
         assert estimate

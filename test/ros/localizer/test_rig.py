@@ -36,7 +36,6 @@ def recording(tmp_path_factory) -> Path:
     record(
         path, 0.7,
         keep=lambda image: image.name == "left" or not 1.2e9 < image.frame.stamp_ns < 1.37e9,
-        max_orientation_deviation=1.0,
     )  # fmt: skip
     return path
 
