@@ -145,7 +145,6 @@ ROS_MAY_IMPORT: dict[str, set[str]] = {
     "node": set(),
     "localizer": {"node"},
     "detector": {"node"},
-    "graph": {"node"},
 }
 
 

@@ -12,7 +12,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from rs_localizer.io import topics
 from rs_localizer.ros.node.managed import executor_of
 from rs_localizer.settings import NODE_NAME
 
+_SETTINGS = {"readout_time": READOUT_TIME}
 _NODE = "import sys; from rs_localizer.ros.main import main; sys.exit(main())"
 
 # s: only what hangs takes an hour, on whatever machine.
@@ -94,7 +95,9 @@ class Ear:
 
 
 @contextlib.contextmanager
-def running(count: int) -> Iterator[tuple[Node, list[tuple[str, int]]]]:
+def running(
+    count: int, settings: Mapping[str, Any] = _SETTINGS
+) -> Iterator[tuple[Node, list[tuple[str, int]]]]:
     """That many live nodes: our own node, and their namespaces and process ids.
 
     Raises:
@@ -109,7 +112,8 @@ def running(count: int) -> Iterator[tuple[Node, list[tuple[str, int]]]]:
             nodes = []
             for index in range(count):
                 namespace = f"/load_{os.getpid()}/camera{index}"
-                processes.append(_started(namespace, Path(directory) / f"node{index}.log"))
+                log = Path(directory) / f"node{index}.log"
+                processes.append(_started(namespace, log, settings))
                 nodes.append((namespace, processes[-1].pid))
             yield peer, nodes
         finally:
@@ -120,8 +124,9 @@ def running(count: int) -> Iterator[tuple[Node, list[tuple[str, int]]]]:
             rclpy.try_shutdown()
 
 
-def _started(namespace: str, log: Path) -> subprocess.Popen[bytes]:
-    words = ("--ros-args", "-r", f"__ns:={namespace}", "-p", f"readout_time:={READOUT_TIME}")
+def _started(namespace: str, log: Path, settings: Mapping[str, Any]) -> subprocess.Popen[bytes]:
+    words = ["--ros-args", "-r", f"__ns:={namespace}"]
+    words += [word for name, value in settings.items() for word in ("-p", f"{name}:={value}")]
     with log.open("wb") as file:
         process = subprocess.Popen([sys.executable, "-c", _NODE, *words], stdout=file, stderr=file)
     deadline = time.monotonic() + _START_TIMEOUT

@@ -25,7 +25,6 @@ import math
 import os
 import random
 import sys
-import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -37,17 +36,20 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.time import Time
+from sensor_msgs.msg import CameraInfo, PointCloud2
 
-from benchmarks.load.measuring import cpu_time
+from benchmarks.load.measuring import cpu_time, running
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.messages import make_quaternion, make_vector, stamp_ns
 from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info, make_correspondences
+from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES
 from rs_localizer.io.transforms import Transform, from_numbers, make_transform, read_transform
-from rs_localizer.ros.graph.live import LiveNode
-from rs_localizer.ros.node.conversion import make_message
+from rs_localizer.ros.node.conversion import copy_message, make_message
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, simulate_frames
 from rs_localizer.tools.simulation.simulated_settings import BODY_FROM_CAMERA, FrameSettings
@@ -160,16 +162,13 @@ def driven(trouble: Trouble, drift: tuple[float, float], **settings: Any) -> Hea
     drive = Drive(trouble.seconds, trouble.carried)
     world = room(sampled_states(drive, 0.5).positions, np.random.default_rng(0), count=20_000)
     frames = list(simulate_frames(CAMERA, drive, world, FrameSettings(100, 0.7, 0.2), seed=1))
-    with _tf2_ros() as tf2, tempfile.TemporaryDirectory() as place:
-        log = Path(place) / "log"
-        own = {
-            "readout_time": CAMERA.readout_time, "base_frame": "base_link",
-            "publish_tf": "map_to_odom",
-        }  # fmt: skip
-        with LiveNode({**own, **settings}, log, 0) as live:
-            live.wait(lambda _: None)
-            around = _Around(live, tf2, drive, drift, trouble)
-            around.play(frames)
+    own = {
+        "readout_time": CAMERA.readout_time, "base_frame": "base_link",
+        "publish_tf": "map_to_odom",
+    }  # fmt: skip
+    with _tf2_ros() as tf2, running(1, {**own, **settings}) as (peer, [(namespace, pid)]):
+        around = _Around((peer, namespace, pid), tf2, drive, drift, trouble)
+        around.play(frames)
     return around.heard
 
 
@@ -177,15 +176,20 @@ class _Around:
     """What is around a live node: it sends, looks, and keeps what it hears."""
 
     def __init__(
-        self, live: LiveNode, tf2: Any, drive: Drive, drift: tuple[float, float], trouble: Trouble
-    ) -> None:
-        self._live, self._drive, self._drift, self._trouble = live, drive, drift, trouble
+        self, live: tuple[Node, str, int], tf2: Any, drive: Drive, drift: tuple[float, float],
+        trouble: Trouble,
+    ) -> None:  # fmt: skip
+        self._drive, self._drift, self._trouble = drive, drift, trouble
         self._missing = tf2.TransformException
         self.heard = Heard()
         # Of ~/map_to_odom: stamp, turn, covariance.
         self._sure: deque[tuple[int, Array, Array]] = deque(maxlen=200)
         self._base_ns = 0
-        node, own = live._node, f"{live.namespace}/rs_localizer"
+        node, space, self._pid = live
+        self._executor, own = SingleThreadedExecutor(), f"{space}/rs_localizer"
+        self._executor.add_node(node)
+        self._infos = node.create_publisher(CameraInfo, f"{space}/{CAMERA_INFO}", 10)
+        self._clouds = node.create_publisher(PointCloud2, f"{space}/{CORRESPONDENCES}", 10)
         self._moving = tf2.TransformBroadcaster(node)
         self._fixed = tf2.StaticTransformBroadcaster(node)
         self._buffer = tf2.Buffer()
@@ -194,12 +198,14 @@ class _Around:
         node.create_subscription(Odometry, f"{own}/odometry", self._take_odometry, 100)
         node.create_subscription(DiagnosticArray, "/diagnostics", self._take_status, 10)
         node.create_subscription(kind, f"{own}/map_to_odom", self._take_sure, 100)
-        self._clicked = node.create_publisher(kind, f"{live.namespace}/initialpose", 10)
+        self._clicked = node.create_publisher(kind, f"{space}/initialpose", 10)
 
     def play(self, frames: Sequence[SimulatedFrame]) -> None:
         """Drive."""
         camera = BODY_FROM_CAMERA["forward_left_up"], np.array([0.0, 0.0, self._drive.height])
         self._fixed.sendTransform(_stamped(0, "base_link", CAMERA_FRAME, Transform(*camera)))
+        while not (self._infos.get_subscription_count() and self._clouds.get_subscription_count()):
+            self._executor.spin_once(timeout_sec=0.1)
         self._base_ns = time.time_ns() + 1_000_000_000
         image = functools.partial(self._send_image, frames)
         rates: tuple[tuple[float, Callable[[float], None], float], ...] = (
@@ -213,13 +219,13 @@ class _Around:
         for when, metres in self._trouble.clicks:
             events.append((when, len(rates), functools.partial(self._click, metres)))
         heapq.heapify(events)
-        used, begun = cpu_time(self._live.pid), time.monotonic()
+        used, begun = cpu_time(self._pid), time.monotonic()
         while events:
             at, _, due = heapq.heappop(events)
             while (left := at - self._since()) > 0.0:
-                self._live._executor.spin_once(timeout_sec=left)
+                self._executor.spin_once(timeout_sec=left)
             due(at)
-        self.heard.cpu = (cpu_time(self._live.pid) - used) / (time.monotonic() - begun)
+        self.heard.cpu = (cpu_time(self._pid) - used) / (time.monotonic() - begun)
         self.listener.unregister()
 
     def _since(self) -> float:
@@ -270,9 +276,10 @@ class _Around:
         share, metres = self._trouble.moved(when)
         hit = frame.ids * 0.618034 % 1.0 < share  # always the same ones, all over the room
         points = frame.points + np.outer(hit, [metres, 0.0, 0.0])
-        self._live.send(make_camera_info(CAMERA, stamp), make_correspondences(
-            stamp, points[kept], frame.pixels[kept], frame.ids[kept]
-        ))  # fmt: skip
+        cloud = make_correspondences(stamp, points[kept], frame.pixels[kept], frame.ids[kept])
+        info = make_camera_info(CAMERA, stamp)
+        for publisher, message in ((self._infos, info), (self._clouds, cloud)):
+            publisher.publish(copy_message(message, message.__msgtype__))
 
     def _look(self, at: float) -> None:
         when = at - _BEFORE

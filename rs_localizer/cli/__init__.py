@@ -71,13 +71,13 @@ def write_all(writers: Mapping[Path, Callable[[Path], object]]) -> None:
 
 
 def import_ros(name: str, what: str) -> Any:
-    """Import a module of ``rs_localizer.ros.graph`` by name: all else works without ROS.
+    """Import a module of ``rs_localizer.ros`` by name: all else works without ROS.
 
     Raises:
         ValueError: without ROS, which ``what`` needs.
     """
     try:
-        return importlib.import_module(f"rs_localizer.ros.graph.{name}")
+        return importlib.import_module(f"rs_localizer.ros.{name}")
     except ImportError as error:
         raise ValueError(
             f"{what} needs ROS 2 ({error}): source a ROS 2 workspace, or install rclpy with pip "

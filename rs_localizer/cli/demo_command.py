@@ -159,18 +159,17 @@ def _live(
     """Localize the flight once more with a live node, and compare."""
     live, late, same = import_ros("live", "a live node"), list[float](), 0
     settings = _settings(_METHODS[0], readout_time)
-    with tempfile.NamedTemporaryFile() as log:
-        place = Path(log.name)
-        with live.LiveNode(settings, place, round(0.5e9 * readout_time)) as node:
-            node.wait(lambda _: None)
-            with stage("The flight through a live node", len(frames)) as step:
-                for stamp, info, cloud in frames:
-                    began, answer = time.perf_counter(), answers.get(stamp)
-                    pose = node.localize(info, cloud)
-                    late.append(time.perf_counter() - began)
-                    there = pose and [getattr(pose.pose.position, axis) for axis in "xyz"]
-                    same += there == (answer and answer.pose.position.tolist())
-                    step(1)
+    with (
+        live.LiveNode(settings, round(0.5e9 * readout_time)) as node,
+        stage("The flight through a live node", len(frames)) as step,
+    ):
+        for stamp, info, cloud in frames:
+            began, answer = time.perf_counter(), answers.get(stamp)
+            pose = node.localize(info, cloud)
+            late.append(time.perf_counter() - began)
+            there = pose and [getattr(pose.pose.position, axis) for axis in "xyz"]
+            same += there == (answer and answer.pose.position.tolist())
+            step(1)
     p50, p95 = np.percentile(1e3 * np.array(late), [50, 95])
     print(
         f"The live node has answered {same} of {len(frames)} frames as above to the last bit;\n"

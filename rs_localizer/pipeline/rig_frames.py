@@ -3,10 +3,11 @@
 """Images of several cameras become frames: by their stamps, however fast they come.
 
 A frame holds one image of each camera; the middles of their exposures lie within half the shortest
-period of a camera, so that cameras without a common trigger find each other, too. It is complete when all awaited cameras have come, or when an image of the next frame comes. A camera
-that has been missing from some frames in a row is no longer awaited until it comes again. A notice
-names images that are left out: those that come after their frame, and those of a clock that is
-ahead of the others, or has gone back alone. When all clocks go back, a recording has started over.
+period of a camera, so that cameras without a common trigger find each other, too. It is complete
+when all awaited cameras have come, or when an image of the next frame comes. A camera that has been
+missing from some frames in a row is no longer awaited until it comes again. A notice names images
+that are left out: those that come after their frame, and those of a clock that is ahead of the
+others, or has gone back alone. When all clocks go back, a recording has started over.
 :class:`RigFrames` localizes the frames.
 """
 
