@@ -195,6 +195,9 @@ class LocalizerConfig:
     solver: str = setting(
         "r6p_vcwt", "Minimal solver that generates the hypotheses", choices=tuple(SOLVERS)
     )
+    solver_iterations: int = setting(
+        5, "Most iterations of an iterative solver; it stops when it converges", (1, 100)
+    )
     refinement: str = setting(
         RefinementKind.FULL,
         "What follows the search; none: nothing, the model of the best sample is published without "
@@ -212,6 +215,11 @@ class LocalizerConfig:
         "Most minimal samples of the motion search; the global-shutter search before it takes at "
         "most 384",
         (1, 1_000_000),
+    )
+    confidence: float = setting(
+        0.99,
+        "The search stops when a sample without outliers has been drawn with this probability",
+        (0.0, 0.999999),
     )
     min_inliers: int = setting(8, "Fewest inliers of an accepted pose", (7, 1_000_000))
     seed: int = setting(0, "Seed of the random samples; every frame starts from it", (0, 2**31 - 1))
@@ -307,6 +315,9 @@ class Imu:
     gyroscope_noise: float = setting(
         2e-4, "Noise density of the gyroscope, in rad/s/sqrt(Hz)", (1e-7, 1.0)
     )
+    gyroscope_bias_walk: float = setting(
+        1e-4, "Random walk of the gyroscope's bias, in rad/s^2/sqrt(Hz)", (0.0, 1.0)
+    )
     gravity: bool = setting(
         False, "Use the direction of gravity that the accelerometer shows; needs gravity_in_map"
     )
@@ -319,6 +330,21 @@ class Imu:
 
     def __post_init__(self) -> None:
         check(self, "imu.")
+
+
+@dataclass(frozen=True, slots=True)
+class RigSettings:
+    """How the images of several cameras become frames."""
+
+    window: float = setting(
+        0.02,
+        "Images of several cameras form one frame if the middles of their exposures lie within "
+        "this time, in s; cameras without a common trigger need half their period",
+        (0.0, 1.0),
+    )
+
+    def __post_init__(self) -> None:
+        check(self, "rig.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -457,6 +483,7 @@ class NodeConfig(LocalizerConfig):
         "stamp_offset below its name; without names there is one camera",
         read_only=True,
     )
+    rig: RigSettings = field(default_factory=RigSettings)
     gravity_in_map: tuple[float, ...] = setting(
         (0.0, 0.0, -1.0), "Direction in which things fall in the map, of any length: imu.gravity"
     )

@@ -303,12 +303,9 @@ class Draws(NamedTuple):
 
     rotation: Array  # (3,3) to start from
     pools: Pools
+    confidence: float
     most: int
     random: Random
-
-
-# The search goes on while this is the chance that no sample without outliers was drawn: as ever.
-_MISSED = 0.01
 
 
 def search(
@@ -319,7 +316,7 @@ def search(
 
     Blocks draw equally from all pools. The search stops
     when the chance that no sample so far held inliers alone, at the inlier ratios of the best
-    *optimized* motion, is below ``_MISSED``: minimal models see too few of the inliers
+    *optimized* motion, is below ``1 - draws.confidence``: minimal models see too few of the inliers
     to count them (a six-point model sees a tenth). Only models that beat all minimal ones before
     are optimized (LO-RANSAC: Chum, Matas, Kittler, DAGM 2003). Where none is, the best minimal
     model counts, and the search ends late.
@@ -353,7 +350,7 @@ def search(
         left = draws.most - int(drawn.sum())
         # The chance that none of the samples held inliers alone.
         missed = 1.0 if shares is None else np.prod((1.0 - shares**solver.sample_size) ** drawn)
-        if missed < _MISSED:
+        if missed < 1.0 - draws.confidence:
             break
     return best._replace(samples=int(drawn.sum()))
 
@@ -367,8 +364,6 @@ _POOL_SCALE = 0.12
 # thresholds apart was the best one in 13 or 6 of 80 frames.
 SCORE_SCALE = 2.0
 _GLOBAL_SHUTTER_BLOCK = 48
-# Most iterations of an iterative solver, which mostly converges in fewer.
-_SOLVER_ITERATIONS = 5
 _BLOCK = 64
 # A start, or a motion of left-out points, draws at most so many: of a fast camera one pose explains
 # so few points that the search would not end, and 70 to 80 % of outliers need no more (239 frames).
@@ -392,7 +387,7 @@ class MotionSearch:
         threshold = config.inlier_threshold
         self._noise = EXPECTED_NOISE * threshold
         self._optimizes = config.refinement != RefinementKind.NONE
-        expected = self._noise, _SOLVER_ITERATIONS
+        expected = self._noise, config.solver_iterations
         wide = max(GLOBAL_SHUTTER_SCALE * focal_length, threshold)
         self._rough = wide
         score = (SCORE_SCALE if self._optimizes else 1.0) * threshold
@@ -437,7 +432,7 @@ class MotionSearch:
             observations.camera, observations.tau, len(observations.mounts.axes),
             self._start.sample_size, np.ones(observations.count, np.bool_), observed.ranking, False,
         )  # fmt: skip
-        draws = Draws(np.eye(3), pools, most, observed.random)
+        draws = Draws(np.eye(3), pools, self._config.confidence, most, observed.random)
         return search(observations, self._starts, held_terms(), draws, NOTHING)
 
     def _motion(self, observed: Observed, start: Candidate, most: int) -> Candidate:
@@ -456,7 +451,9 @@ class MotionSearch:
             observations.camera, observations.tau, len(observations.mounts.axes),
             self._solver.sample_size, near, observed.ranking, True,
         )  # fmt: skip
-        draws = Draws(rotation_of(start.state), pools, most, observed.random)
+        draws = Draws(
+            rotation_of(start.state), pools, self._config.confidence, most, observed.random
+        )
         return search(observations, self._motions, observed.terms, draws, first)
 
     def _facing(

@@ -30,7 +30,7 @@ class InertialSettings:
     """
 
     gyroscope_noise: float  # rad/s/sqrt(Hz)
-    gyroscope_bias_walk: float = 1e-4  # rad/s^2/sqrt(Hz)
+    gyroscope_bias_walk: float  # rad/s^2/sqrt(Hz)
     scale_deviation: float = 0.03  # of each axis
     mount_deviation: float = 0.035  # rad, about each axis
     time_offset_deviation: float = 0.02  # s

@@ -291,6 +291,7 @@ def inertial_settings(config: NodeConfig) -> InertialSettings:
     """Return what is known of the IMU before any frame."""
     return InertialSettings(
         gyroscope_noise=config.imu.gyroscope_noise,
+        gyroscope_bias_walk=config.imu.gyroscope_bias_walk,
         scale_deviation=config.imu.scale_deviation,
         mount_deviation=config.imu.mount_deviation,
         time_offset_deviation=config.imu.time_offset_deviation

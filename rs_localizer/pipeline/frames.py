@@ -65,7 +65,8 @@ _BESIDE = frozenset({
 
 
 def _of_estimates(config: NodeConfig) -> tuple[object, ...]:
-    config = without_wait(config)
+    rig = config.rig if config.of_cameras else type(config.rig)()
+    config = replace(without_wait(config), rig=rig)
     return tuple(getattr(config, it.name) for it in fields(config) if it.name not in _BESIDE)
 
 

@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Images of several cameras become frames: by their stamps, however fast they come.
 
-A frame holds one image of each camera; the middles of their exposures lie within half the shortest
-period of a camera, so that cameras without a common trigger find each other, too. It is complete
-when all awaited cameras have come, or when an image of the next frame comes. A camera that has been
-missing from some frames in a row is no longer awaited until it comes again. A notice names images
-that are left out: those that come after their frame, and those of a clock that is ahead of the
-others, or has gone back alone. When all clocks go back, a recording has started over.
+A frame holds one image of each camera; the middles of their exposures lie within ``rig.window``. It
+is complete when all awaited cameras have come, or when an image of the next frame comes. A camera
+that has been missing from some frames in a row is no longer awaited until it comes again. A notice
+names images that are left out: those that come after their frame, and those of a clock that is
+ahead of the others, or has gone back alone. When all clocks go back, a recording has started over.
 :class:`RigFrames` localizes the frames.
 """
 
@@ -43,9 +42,6 @@ from rs_localizer.pipeline.pose_at_time import PublishedMoment
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unheard
 from rs_localizer.tracking import FrameContext, Tracker
 
-# s: window of a frame until a camera has come twice, and the longest: in more time cameras move
-# otherwise than one velocity says.
-_WINDOW, _MOST_WINDOW = 0.02, 0.05
 # Frames in a row without a camera after which it is not awaited: it may have lost one or two.
 _ABSENT = 3
 # s: what is farther ahead of the last frame is of another clock, if other cameras go on from there.
@@ -67,11 +63,13 @@ class FrameAssembler:
 
     Args:
         names: of all cameras, in the order in which a frame has them.
+        window: s.
         notice: told which camera is left out, and why.
     """
 
-    def __init__(self, names: Sequence[str], notice: Notify) -> None:
-        self._names, self._notice = tuple(names), notice
+    def __init__(self, names: Sequence[str], window: float, notice: Notify) -> None:
+        self._names, self._window_ns = tuple(names), round(window * 1e9)
+        self._notice = notice
         self.reset()
 
     def reset(self) -> None:
@@ -79,7 +77,6 @@ class FrameAssembler:
         self._waiting: dict[str, CameraImage] = {}
         self._last_ns: int | None = None  # middle of the latest image of the last frame
         self._stamps: dict[str, int] = {}  # the last of each camera
-        self._periods: dict[str, int] = {}  # ns, likewise
         self._missed = dict.fromkeys(self._names, 0)  # frames in a row
         self._gone_back: set[str] = set()
 
@@ -121,8 +118,6 @@ class FrameAssembler:
                 return True
             self._leave_out(name, f"its stamps went back by {(before - time_ns) * 1e-9:.3f} s")
             return False
-        if before is not None and time_ns > before:
-            self._periods[name] = time_ns - before
         self._stamps[name] = time_ns
         self._gone_back.discard(name)
         waiting = [other.middle_ns for other in self._waiting.values()]
@@ -140,12 +135,6 @@ class FrameAssembler:
             self._leave_out(name, f"its image is {(self._last_ns - time_ns) * 1e-9:.3f} s late")
             return False
         return True
-
-    @property
-    def _window_ns(self) -> int:
-        if not self._periods:
-            return round(_WINDOW * 1e9)
-        return min(min(self._periods.values()) // 2, round(_MOST_WINDOW * 1e9))
 
     def _is_ahead(self, time_ns: int) -> bool:
         return self._last_ns is not None and time_ns - self._last_ns > _LONGEST_STEP * 1e9
@@ -220,7 +209,7 @@ class RigFrames(FrameLocalizer):
     def __init__(
         self, config: NodeConfig, notice: Notify = unheard, transforms: Transforms | None = None
     ) -> None:
-        self._assembler = FrameAssembler(config.cameras, notice)
+        self._assembler = FrameAssembler(config.cameras, config.rig.window, notice)
         self._mounts: dict[str, Transform] = {}  # on the first camera, where they are known
         super().__init__(config, notice, transforms)
 
@@ -228,6 +217,12 @@ class RigFrames(FrameLocalizer):
         tracks = config.tracking and is_timed(config, cameras)
         localizer = Localizer(self._mounted_cameras(cameras), config)
         return Tracker(localizer, None, tracks, max_prediction=config.max_prediction)
+
+    def _apply_settings(self, config: NodeConfig) -> None:
+        before = self._config.rig
+        super()._apply_settings(config)
+        if config.rig != before:
+            self._assembler = FrameAssembler(config.cameras, config.rig.window, self._notice)
 
     def _forget_frames(self) -> None:
         pass  # what waits for other images is no previous frame

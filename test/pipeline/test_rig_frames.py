@@ -10,10 +10,10 @@ from rs_localizer.pipeline.rig_frames import CameraImage, FrameAssembler
 class Watched:
     """A pair, and what was said of it."""
 
-    def __init__(self):
+    def __init__(self, window=0.02):
         self.said = []
         names = ("front", "rear")
-        self.pair = FrameAssembler(names, lambda _, text: self.said.append(text))
+        self.pair = FrameAssembler(names, window, lambda _, text: self.said.append(text))
 
     def add(self, *times):
         """Images as "f33": of the front camera, in the middle of its exposure at 33 ms."""
@@ -34,15 +34,11 @@ def test_frames_do_not_depend_on_which_camera_comes_first(order):
     assert watched.said == []
 
 
-def test_images_half_a_period_apart_are_one_frame_and_others_are_not():
-    """At 10 Hz and at 100 Hz, without a setting; the first ones by a window of 20 ms."""
-    slow, fast = Watched(), Watched()
-    found = slow.add("f0", "r45", "f100", "r145", "f200", "r245")
-    assert found == ["f0", "r45", "f100 r145", "f200 r245"]
-    assert fast.add("f0", "r4", "f10", "r14", "f20", "r29", "f30") == [
-        "f0 r4", "f10 r14", "f20", "f30 r29"
-    ]  # fmt: skip
-    assert slow.said == fast.said == []
+def test_images_outside_the_window_are_frames_of_their_own():
+    watched = Watched(window=0.01)
+    assert watched.add("f0", "r15", "f33", "r48", "f67") == ["f0", "r15", "f33", "r48"]
+    assert watched.add("r68") == ["f67 r68"]
+    assert watched.said == []
 
 
 def test_a_camera_that_stops_is_no_longer_awaited_and_named():
