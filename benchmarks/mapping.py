@@ -264,8 +264,8 @@ def _survey(wall: bool, seeds: list[int]) -> _Errors:
     size = 0.06 if wall else 0.15
     film = Film(_CAMERA, walk, np.arange(0.0, 30.0, 1.0 / 30.0))
     camera = _believed(_READOUT)
-    filmed = Filmed(camera, spotted=film.spot(poses, size, rng))
-    found = survey([filmed], every_marker([family(_FAMILY)], size, {}))
+    filmed = Filmed(camera, film.spot(poses, size, rng))
+    found = survey(filmed, every_marker([family(_FAMILY)], size, {}))
     turn, origin = poses[found.markers[0].id]
     true = [(turn.T @ poses[m.id][0], turn.T @ (poses[m.id][1] - origin)) for m in found.markers]
     off = _off(found, true, np.eye(3), np.zeros(3))

@@ -5,10 +5,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 from rs_localizer.cli import WORKING
 from rs_localizer.cli.image_input import LensOptions
@@ -18,14 +18,11 @@ if WORKING:
     import numpy as np
     from scipy.spatial.transform import Rotation
 
-    from rs_localizer.config import CameraSettings, NodeConfig
+    from rs_localizer.config import NodeConfig
     from rs_localizer.core.arrays import Array
     from rs_localizer.io.bags import is_bag, open_bag
-    from rs_localizer.io.rigs import read_camchain
-    from rs_localizer.io.transforms import Transform
-    from rs_localizer.offline.recordings import camera_topics, optical_frame, transform_between
-    from rs_localizer.tools.adjust.variables import Extrinsics, MountPrior
-    from rs_localizer.tools.rig_mounts import DETERMINED
+    from rs_localizer.offline.recordings import camera_topics, optical_frame
+    from rs_localizer.tools.adjust.variables import Extrinsics
     from rs_localizer.tools.verdict import numbers
 
 
@@ -92,67 +89,3 @@ def mounting_lines(name: str, first: str, mounted: Extrinsics, deviations: Array
         f"{f'place in {first}':26} {numbers(1e3 * mounted.centre, 2)} +- {numbers(moved, 2)} mm",
         f"{'offset of its stamps':26} {1e3 * mounted.offset:+.3f} +- {1e3 * deviations[6]:.3f} ms",
     ]
-
-
-# The input that a map is made from.
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MapCamera(Generic[T]):
-    """A camera that a map is made with, alone or of a rig."""
-
-    name: str  # empty: it is alone
-    args: T  # with its recording and topics
-    config: NodeConfig  # with its shutter and clock
-    mounting: MountPrior | None  # None: the axes are its own
-
-
-def map_cameras(args: T, recordings: Sequence[Path], config: NodeConfig) -> list[MapCamera[T]]:
-    """Return the cameras of recordings; those of a rig in the axes of the first.
-
-    Raises:
-        UsageError: when it is not known how they are mounted, or what their shutters are.
-    """
-    if len(recordings) == 1 and not config.of_cameras:
-        check_there(recordings)
-        alone = replace(args, recording=recordings[0])
-        return [MapCamera("", alone, config, None)]
-    sources = cameras_of(args, recordings, config)
-    if args.calibration is not None:
-        parts = read_camchain(args.calibration)
-        known = [name for name in sources if name in parts.cameras]
-        given = {name: Transform(*parts.camera_from_rig[name]) for name in known}
-        shutters = {
-            name: CameraSettings(
-                camera.readout_time, camera.scan_direction, parts.time_offset.get(name, 0.0)
-            )
-            for name, camera in parts.cameras.items()
-        } | dict(config.of_cameras)
-    else:
-        given, shutters = _by_tf(sources), dict(config.of_cameras)
-    if lacking := [name for name in sources if name not in given]:
-        raise UsageError(
-            f"it is not known where {', '.join(lacking)} of the rig is mounted: give --camera "
-            "CAMCHAIN, or a bag with TF; calibrate --rig finds it"
-        )
-    if lacking := [name for name in sources if not shutters[name].readout_time > 0.0]:
-        raise UsageError(f"no readout_time of {', '.join(lacking)}: calibrate --rig finds it")
-    first = given[next(iter(sources))].inverse()
-    cameras = list[MapCamera[T]]()
-    for name, (own, _) in sources.items():
-        pose, mounting = given[name] @ first, None
-        if cameras:
-            extrinsics = Extrinsics(pose.rotation, -pose.rotation.T @ pose.translation, 0.0)
-            mounting = MountPrior(extrinsics, np.repeat(DETERMINED, [3, 3, 1]))
-        cameras.append(MapCamera(name, own, replace(config, **asdict(shutters[name])), mounting))
-    return cameras
-
-
-def _by_tf(sources: Mapping[str, tuple[LensOptions, str]]) -> dict[str, Transform]:
-    """Return poses of the cameras by TF of a bag, in the axes of the first of them."""
-    args, first = next(iter(sources.values()))
-    if not is_bag(args.recording):
-        return {}
-    with open_bag(args.recording) as bag:
-        poses = {name: transform_between(bag, own, first) for name, (_, own) in sources.items()}
-    return {name: pose for name, pose in poses.items() if pose is not None}

@@ -33,7 +33,6 @@ from rs_localizer.tools.adjust.variables import (
     CameraView,
     Extrinsics,
     Freedom,
-    MountPrior,
     Unknowns,
 )
 from rs_localizer.tools.camera_calibration import CameraCalibration, cut
@@ -115,9 +114,8 @@ def calibrate_rig(recordings: Mapping[str, Recording]) -> dict[str, Mounted]:
                 extrinsics = first_extrinsics(spline, state.spline, shift)
             except Undetermined as error:
                 raise ValueError(f"{name}: {error}") from error
-            nothing = MountPrior(extrinsics, np.full(EXTRINSICS, np.inf))
             state = replace(state, extrinsics=extrinsics)
-            freedom = replace(freedom, mounting=nothing)
+            freedom = replace(freedom, mount=True)
         seen = calibration.posed.observations
         seen = replace(seen, times=seen.times + shift)
         seen = seen.subset(spline.layout.inside(seen.times + state.extrinsics.offset))

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,6 @@ from rs_localizer.cli import WORKING, earlier_result, refuse_existing, write_all
 from rs_localizer.cli.image_input import LensOptions, given_lens
 from rs_localizer.cli.map import check_readout
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
-from rs_localizer.cli.rig_input import MapCamera, map_cameras, mounting_lines
 from rs_localizer.cli.settings_args import given_settings, given_topics, given_values
 from rs_localizer.io.maps.files import SUFFIX, read_map_file, write_npz
 from rs_localizer.io.topics import IMU
@@ -23,7 +22,9 @@ if WORKING:
     import numpy as np
     from tqdm import tqdm
 
+    from rs_localizer.config import NodeConfig
     from rs_localizer.core.arrays import Array
+    from rs_localizer.core.camera import Camera
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.bags import open_bag
     from rs_localizer.io.camera_files import write_calibration
@@ -35,13 +36,8 @@ if WORKING:
     from rs_localizer.offline.replay import find_topics
     from rs_localizer.settings import build
     from rs_localizer.tools.mapping.global_shutter import GlobalShutterModel, undo_shutter
-    from rs_localizer.tools.mapping.map_keypoints import (
-        MapFreedom,
-        RecordedMap,
-        RigCamera,
-        from_recordings,
-    )
-    from rs_localizer.tools.mapping.refinement import RefinedMap, refine_rig
+    from rs_localizer.tools.mapping.map_keypoints import MapFreedom, RecordedMap, from_recording
+    from rs_localizer.tools.mapping.refinement import RefinedMap, refine
 
 _HOLD = 0.001  # m, of landmarks of known place: as a tape or a total station measures them
 _step = partial(print, "adjusted:", flush=True)
@@ -49,7 +45,7 @@ _step = partial(print, "adjusted:", flush=True)
 
 @dataclass(frozen=True, kw_only=True)
 class Options(LensOptions, ResultOptions):
-    recordings: list[Path] = argument("a bag of correspondences or keypoints", "RECORDING", list)
+    recording: Path = argument("a bag of correspondences or keypoints", "RECORDING", Path())
     map: Path | None = option("the map (default: the points of the recording)", "MAP")
     out: Path | None = option(f"ends in {SUFFIX}", "OUT")
     intrinsics: bool = option("adjust the lens as well", default=False)
@@ -71,33 +67,31 @@ def run(args: Options) -> None:
     if args.colmap is not None:
         _undo_shutter(args, *args.colmap)
         return
-    if not args.recordings or args.out is None:
+    if args.recording == Path() or args.out is None:
         raise UsageError("give RECORDING and --out OUT, or --colmap IN OUT")
     if args.out.suffix != SUFFIX:
         raise UsageError(f"--out must end in {SUFFIX}, got {args.out}")
     config = given_settings(args)
     refuse_existing(args)
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
-    cameras = map_cameras(args, args.recordings, config)
-    known = all(of.config.readout_time > 0.0 for of in cameras)
-    rig, clouds = zip(*(_recorded(of, landmarks) for of in cameras), strict=True)
-    with tqdm(total=sum(map(len, clouds)), unit="image", desc="localize", disable=None) as bar:
-        localized = from_recordings([one.camera for one in rig], clouds, landmarks, bar.update)
+    camera, clouds = _recorded(args, config, landmarks)
+    with tqdm(total=len(clouds), unit="image", desc="localize", disable=None) as bar:
+        localized = from_recording(camera, clouds, landmarks, bar.update)
     deviations = _deviations(args, localized.landmarks, config.map_deviation)
-    freedom = MapFreedom(not known, args.intrinsics, deviations)
-    refined = refine_rig(rig, localized.seen, localized.start, freedom, done=_step)
-    names = [of.name for of in cameras]
-    _print_result(localized, refined, names)
-    for name, result in zip(names, refined.cameras, strict=True):
-        check_readout(result.readout_check, name)
-    _write(args, args.out, localized.landmarks, refined, names)
+    freedom = MapFreedom(not config.readout_time > 0.0, args.intrinsics, deviations)
+    refined = refine(
+        camera, localized.seen, localized.start, freedom, stamp_offset=config.stamp_offset,
+        done=_step,
+    )  # fmt: skip
+    _print_result(localized, refined)
+    check_readout(refined.readout_check)
+    _write(args, args.out, localized.landmarks, refined)
 
 
 def _recorded(
-    of: MapCamera[Options], landmarks: Map | None
-) -> tuple[RigCamera, tuple[Correspondences, ...]]:
-    """Return a camera and the correspondences with the map that it saw."""
-    config, args = of.config, of.args
+    args: Options, config: NodeConfig, landmarks: Map | None
+) -> tuple[Camera, tuple[Correspondences, ...]]:
+    """Return the camera and the correspondences with the map that it saw."""
     with open_bag(args.recording) as bag:
         topics = find_topics(bag, given_topics(args)).without(IMU)
         recorded = read_recording(bag, topics, landmarks)
@@ -105,7 +99,7 @@ def _recorded(
     camera = recorded.calibration.camera(*shutter)
     if lens := given_lens(args):
         camera = replace(lens, readout_time=shutter[0], scan_direction=shutter[1])
-    return RigCamera(camera, config.stamp_offset, of.mounting), recorded.clouds
+    return camera, recorded.clouds
 
 
 def _deviations(args: Options, landmarks: Map, map_deviation: float) -> Array | None:
@@ -120,7 +114,7 @@ def _deviations(args: Options, landmarks: Map, map_deviation: float) -> Array | 
     return np.where(np.isin(landmarks.ids, args.hold), _HOLD, every)
 
 
-def _print_result(localized: RecordedMap, refined: RefinedMap, names: Sequence[str]) -> None:
+def _print_result(localized: RecordedMap, refined: RefinedMap) -> None:
     moved = np.linalg.norm(refined.points - localized.start.points, axis=1)[refined.refined]
     spread = np.sqrt(np.trace(refined.covariances[refined.refined], axis1=1, axis2=2))
     rows = {
@@ -134,19 +128,12 @@ def _print_result(localized: RecordedMap, refined: RefinedMap, names: Sequence[s
         far = f"{1e3 * np.median(moved):.1f} mm (median), {1e3 * moved.max():.1f} at most"
         rows["landmarks moved by"] = far
         rows["deviation of a landmark"] = f"{1e3 * np.median(spread):.1f} mm (median)"
-    for of, camera in zip(names, refined.cameras, strict=True):
-        deviation = camera.readout_time_deviation
-        text = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
-        name = f"{of}: readout time" if of else "readout time"
-        rows[name] = f"{1e3 * camera.readout_time:.3f}{text} ms"
+    deviation = refined.readout_time_deviation
+    text = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
+    rows["readout time"] = f"{1e3 * refined.readout_time:.3f}{text} ms"
     _print(rows)
-    for of, camera in zip(names, refined.cameras, strict=True):
-        if camera.deviations.any():
-            lines = mounting_lines(of, names[0], camera.extrinsics, camera.deviations)
-            print("\n".join([*lines[:-1], f"{lines[-1]} besides what is set"]))
-        if camera.readout_time < 0.0:
-            whose = f"the readout time of {of}" if of else "the readout time"
-            print(f"{whose} is negative: the scan direction is the reverse of what was set")
+    if refined.readout_time < 0.0:
+        print("the readout time is negative: the scan direction is the reverse of what was set")
 
 
 def _print(rows: dict[str, str]) -> None:
@@ -154,16 +141,14 @@ def _print(rows: dict[str, str]) -> None:
         print(f"{name:28} {text}")
 
 
-def _write(
-    args: Options, out: Path, landmarks: Map, result: RefinedMap, names: Sequence[str]
-) -> None:
+def _write(args: Options, out: Path, landmarks: Map, result: RefinedMap) -> None:
     refined = replace(
         landmarks, points=result.points, covariances=result.covariances, error_modes=None
     )
     writers: dict[Path, Callable[[Path], object]] = {out: lambda part: write_npz(part, refined)}
-    for name, camera in zip(names, result.cameras, strict=True) if args.intrinsics else ():
-        lens = out.with_name(f"{out.stem}{f'_{name}' if name else ''}_camera_info.yaml")
-        writers[lens] = partial(write_calibration, camera=camera.camera)
+    if args.intrinsics:
+        lens = out.with_name(f"{out.stem}_camera_info.yaml")
+        writers[lens] = partial(write_calibration, camera=result.camera)
     write_all(writers)
     if unchanged := np.count_nonzero(~result.refined):
         print(
@@ -176,9 +161,9 @@ def _write(
 
 
 def _undo_shutter(args: Options, folder: Path, out: Path) -> None:
-    for name in ("recordings", "out", "map", "hold"):
-        if getattr(args, name) not in (None, []):
-            raise UsageError(f"--colmap goes without {'--' * (name != 'recordings')}{name}")
+    for name in ("recording", "out", "map", "hold"):
+        if getattr(args, name) not in (None, [], Path()):
+            raise UsageError(f"--colmap goes without {'--' * (name != 'recording')}{name}")
     try:
         model = read_model(folder)
     except MapError as error:

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +12,6 @@ from rs_localizer.cli import WORKING, refuse_existing, write_all
 from rs_localizer.cli.image_input import ImageOptions, opened, print_left_out, print_times
 from rs_localizer.cli.map import check_readout
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
-from rs_localizer.cli.rig_input import MapCamera, map_cameras, mounting_lines
 from rs_localizer.cli.settings_args import given_settings
 from rs_localizer.markers.families import FAMILIES, Family, family
 
@@ -21,7 +19,7 @@ if WORKING:
     import numpy as np
     from tqdm import tqdm
 
-    from rs_localizer.core.arrays import Array
+    from rs_localizer.config import NodeConfig
     from rs_localizer.core.camera import Camera
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.markers.maps import MarkerMap, other_units
@@ -35,10 +33,7 @@ _LISTED = 12
 
 @dataclass(frozen=True, kw_only=True)
 class Options(ImageOptions, ResultOptions):
-    recordings: list[Path] = argument(
-        "a video, a folder of images, or a bag; several: of cameras on one body, named as their "
-        "files", "RECORDING",
-    )  # fmt: skip
+    recording: Path = argument("a video, a folder of images, or a bag", "RECORDING")
     family: list[str] = option(
         f"of the markers; may be repeated: {', '.join(FAMILIES)}", "NAME", list, required=True
     )
@@ -63,13 +58,11 @@ def run(args: Options) -> None:
         if origin is None:
             raise UsageError(f"--origin: {' and '.join(args.family)} have no id {args.origin}")
     refuse_existing(args)
-    spotter, cameras = Spotter(markers), map_cameras(args, args.recordings, config)
-    filmed = [_filmed(camera, spotter) for camera in cameras]
+    filmed = _filmed(args, config, Spotter(markers))
     found = survey(filmed, markers, origin=origin)
     every = found.deviations_of_shape
-    _print_result(found, every, cameras, filmed)
-    for camera, result in zip(cameras, found.cameras, strict=True):
-        check_readout(result.readout_check, camera.name)
+    _print_result(found, len(filmed.spotted))
+    check_readout(found.shutter.readout_check)
     pairs = zip(found.markers, every, strict=True)
     surveyed = tuple(replace(marker, deviations=deviations) for marker, deviations in pairs)
     marker_map = MarkerMap(surveyed)
@@ -105,9 +98,9 @@ def _markers(args: Options) -> tuple[Marker, ...]:
     return every_marker(families, size, sizes)
 
 
-def _filmed(given: MapCamera[Options], spotter: Spotter) -> Filmed:
-    """Return a camera and the markers of each image."""
-    args, config, spotted = given.args, given.config, dict[int, Spotted]()
+def _filmed(args: Options, config: NodeConfig, spotter: Spotter) -> Filmed:
+    """Return the camera and the markers of each image."""
+    spotted = dict[int, Spotted]()
     camera: Camera | None = None
     with opened(args) as source:
         refused = dict[str, str]()
@@ -123,33 +116,22 @@ def _filmed(given: MapCamera[Options], spotter: Spotter) -> Filmed:
         raise ValueError(f"{args.recording} has no image that can be read")
     every = [spotted[stamp] for stamp in sorted(spotted)]
     camera = replace(camera, readout_time=config.readout_time)
-    return Filmed(camera, config.stamp_offset, given.mounting, every)
+    return Filmed(camera, every, config.stamp_offset)
 
 
-def _print_result(
-    found: Survey, every: Array, cameras: Sequence[MapCamera[Options]], filmed: Sequence[Filmed]
-) -> None:
-    """Print the table of the markers, with their deviations (m,6)."""
-    fit = found.fit
+def _print_result(found: Survey, images: int) -> None:
+    """Print the table of the markers, with their deviations."""
+    fit, shutter = found.fit, found.shutter
     print(f"noise of the corners     {fit.deviation:.3f} px, {np.mean(fit.inliers):.1%} fit")
-    for given, images, result, count in zip(
-        cameras, filmed, found.cameras, found.images, strict=True
-    ):
-        of = f"{given.name}: " if given.name else ""
-        print(f"{f'{of}images with a marker':24} {count} of {len(images.spotted)}")
-        deviation = result.readout_time_deviation
-        spread = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
-        print(f"{f'{of}readout time':24} {1e3 * result.readout_time:.3f}{spread} ms")
-        if images.mounting is not None:
-            offset = images.stamp_offset + result.extrinsics.offset
-            mounted = replace(result.extrinsics, offset=offset)
-            lines = mounting_lines(given.name, cameras[0].name, mounted, result.deviations)
-            print("\n".join(lines))
+    print(f"{'images with a marker':24} {found.images} of {images}")
+    deviation = shutter.readout_time_deviation
+    spread = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
+    print(f"{'readout time':24} {1e3 * shutter.readout_time:.3f}{spread} ms")
     print(
         f"{'marker':26} {'images':>6} {'x':>9} {'y':>9} {'z (m)':>9} {'+- (mm)':>8} {'+- (deg)':>8}"
     )
     for marker, sights, deviations, poor in zip(
-        found.markers, found.sights, every, found.poor, strict=True
+        found.markers, found.sights, found.deviations_of_shape, found.poor, strict=True
     ):
         x, y, z = marker.pose.position
         place = 1e3 * np.linalg.norm(deviations[:3])

@@ -50,7 +50,6 @@ class Problem:
         views: of the cameras, of which the first has what is expected of the motion.
         start: first guess.
         noises: (k,) px, of each camera's keypoints; they keep their ratios (None: all alike).
-        one_map: the free landmarks are common to all views; they come last in the border, once.
         deviations: (p,) m, of landmarks that are all free and the same of all, and eliminated,
             about where they are observed to be; None: what the views' freedom says.
         floating: nothing holds the whole but its start.
@@ -58,9 +57,9 @@ class Problem:
 
     def __init__(
         self, views: Sequence[CameraView], start: Unknowns, noises: Array | None = None,
-        one_map: bool = False, deviations: Array | None = None, floating: bool = False,
+        deviations: Array | None = None, floating: bool = False,
     ) -> None:  # fmt: skip
-        self.views, self._one_map, self.deviations = list(views), one_map, deviations
+        self.views, self.deviations = list(views), deviations
         self.freedom, self.camera = self.views[0].freedom, self.views[0].camera
         noises = np.ones(len(self.views)) if noises is None else noises
         self.noises, self.ratios = noises, noises / noises[0]
@@ -83,17 +82,13 @@ class Problem:
             for name, size in (
                 ("readout", int(free.readout_time)),
                 ("lens", len(own.lens) if free.lens else 0),
-                ("mount", EXTRINSICS if free.mounting is not None else 0),
-                ("points", 0 if self._one_map or self.deviations is not None else pieces.columns),
+                ("mount", EXTRINSICS if free.mount else 0),
+                ("points", 0 if self.deviations is not None else pieces.columns),
             ):
                 if size:
                     at[name] = column
                     column += size
             self.at.append(at)
-        if self._one_map and self.pieces[0].columns:
-            for at in self.at:
-                at["points"] = column
-            column += self.pieces[0].columns
         self.gyro: Gyroscope | None = None
         gyro = self.views[0].observations.gyro
         if gyro is not None and start.mount is not None:
@@ -180,10 +175,7 @@ class Problem:
         if "lens" in at:
             mean, information = self._lens_priors[k]
             terms.append(known(own.lens - mean, information, at["lens"]))
-        if (mounting := freedom.mounting) is not None:
-            off = own.extrinsics.beside(mounting.given)
-            terms.append(known(off, np.diag(mounting.deviations**-2.0), at["mount"]))
-        if "points" in at and self.deviations is None and not (k and self._one_map):
+        if "points" in at and self.deviations is None:
             if pieces.rigid:  # a body none of whose landmarks fits stays where it is
                 information = np.full(pieces.columns, _LOOSE_BODY**-2)
                 offset = np.zeros(pieces.columns)
@@ -238,7 +230,7 @@ class Problem:
     def of_views(self, views: Sequence[CameraView], start: Unknowns) -> Problem:
         """Return the problem with other views of the cameras."""
         floating = self.floating is not None
-        return Problem(views, start, self.noises, self._one_map, self.deviations, floating)
+        return Problem(views, start, self.noises, self.deviations, floating)
 
     def trusted(self, start: Unknowns) -> Problem:
         """Return the problem with the trusted keypoints only."""

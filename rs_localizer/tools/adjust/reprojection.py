@@ -73,7 +73,7 @@ class Reprojection:
         free, width = self.free, self.pieces.width if self.pieces.count else 0
         return Terms(
             float(own.readout_time), self.camera.row_time_gradient, free.readout_time, free.lens,
-            free.mounting is not None, width, free.stamps > 0.0, deviation**2,
+            free.mount, width, free.stamps > 0.0, deviation**2,
             (LIMIT * deviation) ** 2,
         )  # fmt: skip
 

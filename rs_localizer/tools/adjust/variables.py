@@ -125,14 +125,6 @@ class Extrinsics:
         return step
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MountPrior:
-    """Prior of extrinsics."""
-
-    given: Extrinsics
-    deviations: Array  # (7,) of a step from there: rad, m, s; infinite: nothing
-
-
 @dataclass(frozen=True, slots=True)
 class Freedom:
     """Unknowns beside the motion, and their priors."""
@@ -156,9 +148,7 @@ class Freedom:
     # The noise is at least this (px). Where images have hardly more keypoints than numbers of their
     # own, a robust estimate rejects all but those it can run through, and ends at no noise at all.
     least_noise: float = 1e-4  # recordings without noise are simulated
-    # Prior of the camera's extrinsics on the rig that moves, and of its clock; None: they are
-    # known.
-    mounting: MountPrior | None = None
+    mount: bool = False  # the camera's extrinsics on the rig that moves, and its clock
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,11 +178,6 @@ class Unknowns:
     extrinsics: Extrinsics = field(default_factory=Extrinsics.none)
     # Unknowns of the other cameras of a rig, which move along this spline.
     others: tuple[Unknowns, ...] = ()
-
-    def with_landmarks(self, landmarks: Array) -> Unknowns:
-        """Return the unknowns with the same landmarks (p,3) for all cameras."""
-        others = tuple(replace(one, landmarks=landmarks) for one in self.others)
-        return replace(self, landmarks=landmarks, others=others)
 
 
 def start_state(

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +15,10 @@ from scipy.sparse.csgraph import connected_components
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.core.types import Estimate
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.maps.landmarks import Map, make_map
 from rs_localizer.tools.adjust.observe import ImagePoints, localize_each
-from rs_localizer.tools.adjust.variables import Extrinsics, MountPrior
 from rs_localizer.tools.mapping.gauge import Similarity
 from rs_localizer.tools.readout_belief import ReadoutCheck
 
@@ -27,30 +26,17 @@ from rs_localizer.tools.readout_belief import ReadoutCheck
 _LEAST_IMAGES, _LEAST_SHARED = 3, 3
 # Fewer observations hold a landmark on one ray, nearly.
 _LEAST_OBSERVATIONS = 3
-# Images of several cameras are taken together if they begin within this time (s): at 1 rad/s, a
-# degree; what two images say of two markers may differ by eight.
-_ONE_FRAME = 0.02
 # An image with fewer keypoints does not know where it is.
 LEAST_KEYPOINTS = 6
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RigCamera:
-    """A camera that a map is made with, of a rig or alone."""
+def middle_row_delay(camera: Camera, stamp_offset: float) -> float:
+    """Return the time (s) from a stamp to the middle row's exposure.
 
-    camera: Camera  # its readout time: 0: a global shutter, or it is to be found
-    stamp_offset: float = 0.0  # s from a stamp to the first row's exposure, by the rig's clock
-    mounting: MountPrior | None = None  # None: its axes are those of the rig
-
-    @property
-    def extrinsics(self) -> Extrinsics:
-        """The mount as it is given."""
-        return Extrinsics.none() if self.mounting is None else self.mounting.given
-
-    @property
-    def delay(self) -> float:
-        """Seconds from a stamp to the middle row's exposure."""
-        return self.stamp_offset - self.camera.readout_time * self.camera.first_row_time
+    Args:
+        stamp_offset: s from a stamp to the first row's exposure.
+    """
+    return stamp_offset - camera.readout_time * camera.first_row_time
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,45 +47,6 @@ class Adjusted:
     readout_time: float  # s; negative: against the scan direction
     readout_time_deviation: float  # s; NaN where it was given
     readout_check: ReadoutCheck | None  # of a given one; None: the images do not tell, or found
-    extrinsics: Extrinsics
-    deviations: Array  # (7,) of a step of the extrinsics: rad, m, s; zeros: they are the rig's axes
-
-
-class RigImages(NamedTuple):
-    """Images of several cameras, one of each at most, that were taken at about one time."""
-
-    time: float  # s, mean of the images' middle rows
-    images: list[tuple[int, int]]  # the camera, and its image
-
-
-def frames_of(times: Sequence[Array]) -> list[RigImages]:
-    """Group images by the times (g,), s, of each camera's."""
-    every = sorted(
-        (float(time), camera, image)
-        for camera, own in enumerate(times)
-        for image, time in enumerate(own)
-    )
-    groups: list[list[tuple[float, int, int]]] = []
-    for one in every:
-        last = groups[-1] if groups else []
-        if last and one[0] - last[0][0] < _ONE_FRAME and one[1] not in {of[1] for of in last}:
-            last.append(one)
-        else:
-            groups.append([one])
-    return [
-        RigImages(sum(of[0] for of in group) / len(group), [of[1:] for of in group])
-        for group in groups
-    ]  # fmt: skip
-
-
-def frame_numbers(times: Array, cameras: IntArray) -> IntArray:
-    """Return the frame of each image (g,), by its time (s) and its camera."""
-    own = [np.flatnonzero(cameras == camera) for camera in range(int(cameras.max()) + 1)]
-    numbers = np.empty(len(times), np.int64)
-    for number, frame in enumerate(frames_of([times[images] for images in own])):
-        for camera, image in frame.images:
-            numbers[own[camera][image]] = number
-    return numbers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,17 +57,10 @@ class MapObservations:
         ValueError: for arrays that do not go together.
     """
 
-    stamps_ns: IntArray  # (g,) ns, of the images' headers; those of a camera rise
+    stamps_ns: IntArray  # (g,) ns, of the images' headers; they rise
     images: IntArray  # (n,) rows of ``stamps_ns``
     landmarks: IntArray  # (n,) rows of ``Start.points``
     pixels: Array  # (n,2) raw
-    cameras: IntArray | None = None  # (g,) of a rig, which of them; None: there is one
-
-    @property
-    def of_cameras(self) -> IntArray:
-        """The camera of each image (g,)."""
-        none = np.zeros(len(self.stamps_ns), np.int64)
-        return none if self.cameras is None else self.cameras
 
     def __post_init__(self) -> None:
         count = len(self.images)
@@ -129,8 +69,7 @@ class MapObservations:
                 f"images (n,), landmarks (n,) and pixels (n,2) must be of one length, got "
                 f"{self.images.shape}, {self.landmarks.shape} and {self.pixels.shape}"
             )
-        of = self.of_cameras
-        if not all(np.all(np.diff(self.stamps_ns[of == k]) > 0) for k in np.unique(of)):
+        if np.any(np.diff(self.stamps_ns) <= 0):
             raise ValueError("the images' stamps must rise")
         if count and not 0 <= self.images.min() <= self.images.max() < len(self.stamps_ns):
             raise ValueError("keypoints are of images without a stamp")
@@ -175,12 +114,8 @@ def shared_landmarks(observations: MapObservations) -> BoolArray:
     return np.bincount(pairs[:, 0]) > 1
 
 
-def check(observations: MapObservations, points: int, delays: Array) -> None:
-    """Raise ValueError when the images do not make one map of this many points, and say why.
-
-    Args:
-        delays: (k,) s, of each camera's middle rows after their stamps.
-    """
+def check(observations: MapObservations, points: int) -> None:
+    """Raise ValueError when the images do not make one map of this many points, and say why."""
     rows = observations.landmarks
     if len(rows) and not 0 <= rows.min() <= rows.max() < points:
         raise ValueError(f"keypoints are of landmarks that are not among the {points} of the map")
@@ -192,11 +127,7 @@ def check(observations: MapObservations, points: int, delays: Array) -> None:
     shared = shared_landmarks(observations) if len(observations.images) else np.zeros(0, np.bool_)
     if not shared.any():
         raise ValueError("no overlap: no landmark is seen by two images")
-    times = 1e-9 * (observations.stamps_ns - observations.stamps_ns.min())
-    frames = frame_numbers(times + delays[observations.of_cameras], observations.of_cameras)
-    sizes = _parts(observations, shared[observations.landmarks], frames)
-    if len(delays) > 1:  # an image without those of other cameras, as at the ends: by the motion
-        sizes = [size for size in sizes if size > 1]
+    sizes = _parts(observations, shared[observations.landmarks])
     if len(sizes) > 1:
         listed = ", ".join(str(size) for size in sizes[:6]) + (", ..." if len(sizes) > 6 else "")
         raise ValueError(
@@ -205,9 +136,9 @@ def check(observations: MapObservations, points: int, delays: Array) -> None:
         )
 
 
-def _parts(observations: MapObservations, usable: BoolArray, frames: IntArray) -> list[int]:
-    """Number the connected parts of images, or of a rig's frames, largest first."""
-    images, landmarks = frames[observations.images[usable]], observations.landmarks[usable]
+def _parts(observations: MapObservations, usable: BoolArray) -> list[int]:
+    """Number the connected parts of images, largest first."""
+    images, landmarks = observations.images[usable], observations.landmarks[usable]
     ones = np.ones(len(images))
     sees = coo_array((ones, (images, landmarks))).tocsr()
     sees.data[:] = 1.0
@@ -274,53 +205,44 @@ class RecordedMap:
     images: int  # of the recording
 
 
-def from_recordings(
-    cameras: Sequence[Camera], clouds: Sequence[Sequence[Correspondences]],
-    landmarks: Map | None = None, done: Callable[[], object] = lambda: None,
+def from_recording(
+    camera: Camera, clouds: Sequence[Correspondences], landmarks: Map | None = None,
+    done: Callable[[], object] = lambda: None,
 ) -> RecordedMap:  # fmt: skip
     """Return images with a pose, and the landmarks that they show.
 
     Args:
-        cameras: of a rig, or one alone, with their readout times, where these are known.
-        clouds: of the recording of each, one an image.
-        landmarks: the map; None: that of the recordings, by the points that they show.
+        camera: with its readout time, where that is known.
+        clouds: one an image.
+        landmarks: the map; None: that of the recording, by the points that it shows.
         done: called after each image.
 
     Raises:
         ValueError: when points are not of the map, or no image has a pose.
     """
-    images: list[tuple[int, Correspondences]] = []
-    results: list[Estimate | Failure] = []
-    for k, (camera, own) in enumerate(zip(cameras, clouds, strict=True)):
-        once = {cloud.stamp_ns: cloud for cloud in own if len(cloud.points)}
-        every = [once[stamp] for stamp in sorted(once)]
-        images += [(k, cloud) for cloud in every]
-        observed = [ImagePoints(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in every]
-        results += localize_each(camera, observed, done)
+    once = {cloud.stamp_ns: cloud for cloud in clouds if len(cloud.points)}
+    images = [once[stamp] for stamp in sorted(once)]
+    observed = [ImagePoints(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in images]
+    results = localize_each(camera, observed, done)
     if landmarks is None:
-        landmarks = _own_map([cloud for _, cloud in images])
+        landmarks = _own_map(images)
     posed = [
-        (k, cloud, result)
-        for (k, cloud), result in zip(images, results, strict=True)
+        (cloud, result, result.residuals < _MOST_RESIDUAL)
+        for cloud, result in zip(images, results, strict=True)
         if isinstance(result, Estimate)
     ]
     if not posed:
         raise ValueError(f"none of {len(images)} images has a pose; of the last one, {results[-1]}")
-    near = [result.residuals < _MOST_RESIDUAL for _, _, result in posed]
-    counts = [int(np.count_nonzero(of)) for of in near]
     seen = MapObservations(
-        np.array([cloud.stamp_ns for _, cloud, _ in posed], np.int64),
-        np.repeat(np.arange(len(posed)), counts),
-        np.concatenate([
-            _rows_of(landmarks, cloud)[of] for (_, cloud, _), of in zip(posed, near, strict=True)
-        ]),
-        np.concatenate([cloud.pixels[of] for (_, cloud, _), of in zip(posed, near, strict=True)]),
-        np.array([k for k, _, _ in posed], np.int64),
-    )  # fmt: skip
+        np.array([cloud.stamp_ns for cloud, _, _ in posed], np.int64),
+        np.repeat(np.arange(len(posed)), [np.count_nonzero(near) for _, _, near in posed]),
+        np.concatenate([_rows_of(landmarks, cloud)[near] for cloud, _, near in posed]),
+        np.concatenate([cloud.pixels[near] for cloud, _, near in posed]),
+    )
     start = Start(
         landmarks.points,
-        np.array([result.rotation.T for _, _, result in posed]),
-        np.array([result.position for _, _, result in posed]),
+        np.array([result.rotation.T for _, result, _ in posed]),
+        np.array([result.position for _, result, _ in posed]),
     )
     return RecordedMap(landmarks, seen, start, len(images))
 

@@ -9,12 +9,10 @@ adjustment with a global shutter bends the map by what the camera moved while it
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
@@ -24,7 +22,6 @@ from rs_localizer.tools.adjust.fit import inflation_of, left_over, steepness
 from rs_localizer.tools.adjust.intrinsics import with_lens
 from rs_localizer.tools.adjust.problem import Problem, fit_with_noise
 from rs_localizer.tools.adjust.reprojection import LIMIT
-from rs_localizer.tools.adjust.row_kernels import EXTRINSICS
 from rs_localizer.tools.adjust.spline import LONGEST_GAP, Spline
 from rs_localizer.tools.adjust.spline_kernels import CONTROL
 from rs_localizer.tools.adjust.system import Factored, Undetermined
@@ -33,7 +30,7 @@ from rs_localizer.tools.adjust.variables import (
     Freedom,
     SplineKeypoints,
     Unknowns,
-    rig_state,
+    start_state,
 )
 from rs_localizer.tools.mapping.gauge import Similarity, as_held, generators, laid_over, scaled
 from rs_localizer.tools.mapping.initial_trajectory import (
@@ -48,10 +45,9 @@ from rs_localizer.tools.mapping.map_keypoints import (
     Adjusted,
     MapFreedom,
     MapObservations,
-    RigCamera,
     Start,
     check,
-    frame_numbers,
+    middle_row_delay,
     shared_landmarks,
 )
 from rs_localizer.tools.readout_belief import ReadoutCheck
@@ -71,14 +67,15 @@ class Refinement:
     """One map on its way: the keypoints that count, motion, landmarks, and what else is free."""
 
     def __init__(
-        self, rig: Sequence[RigCamera], seen: MapObservations, start: Start, freedom: MapFreedom
-    ) -> None:
-        self.rig, self.shown, self.given, self.wanted = rig, seen, start, freedom
-        self.start_ns = int(seen.stamps_ns.min())
-        delays = np.array([one.delay for one in rig])[seen.of_cameras]
-        self.times = np.asarray(1e-9 * (seen.stamps_ns - self.start_ns) + delays, np.float64)
+        self, camera: Camera, stamp_offset: float, seen: MapObservations, start: Start,
+        freedom: MapFreedom,
+    ) -> None:  # fmt: skip
+        self.camera, self.shown, self.given, self.wanted = camera, seen, start, freedom
+        self.start_ns = int(seen.stamps_ns[0])
+        delay = middle_row_delay(camera, stamp_offset)
+        self.times = np.asarray(1e-9 * (seen.stamps_ns - self.start_ns) + delay, np.float64)
         if freedom.apart:  # each alone
-            self.times = np.arange(len(delays), dtype=np.float64)
+            self.times = np.arange(len(seen.stamps_ns), dtype=np.float64)
         self.size = float(np.linalg.norm(np.ptp(start.points, axis=0)))
         self.deviations, self.floating = self._known()
         self.used = self._usable()
@@ -95,11 +92,17 @@ class Refinement:
                 f"{len(self.times)} images have {held} unknowns of motion, at most "
                 f"{_MOST_UNKNOWNS} can be refined at once: leave images out"
             )
-        self.seen = self._observations()
-        pairs = zip(rig, self.seen, strict=True)
-        self.state = rig_state(
-            self.spline, ((one.camera, own, one.extrinsics) for one, own in pairs)
+        images, pixels = seen.images[self.used], seen.pixels[self.used]
+        self.seen = SplineKeypoints(
+            times=self.times[images],
+            row_times=camera.row_time(pixels),
+            pixels=pixels,
+            landmarks=start.points,
+            points=seen.landmarks[self.used],
+            frames=images,
+            trusted=np.ones(len(images), np.bool_),
         )
+        self.state = start_state(camera, self.seen, self.spline, camera.readout_time)
         self.freedom = Freedom(
             readout_time=freedom.readout_time,
             lens=freedom.lens,
@@ -135,24 +138,12 @@ class Refinement:
         return used & (counts >= LEAST_KEYPOINTS)[self.shown.images]
 
     def _spline(self) -> Spline:
-        """Return a spline through images with keypoints, of a rig through the frames with most.
-
-        Images that follow each other are one stretch.
-        """
-        counts = np.bincount(self.shown.images[self.used], minlength=len(self.times))
-        frames = frame_numbers(self.times, self.shown.of_cameras)
-        order = np.lexsort((-counts, frames))
-        firsts = np.unique(frames[order], return_index=True)[1]
-        best = order[firsts]
-        beyond = np.abs(self.times - self.times[best[frames]])[counts > 0].max()
-        best = best[counts[best] > 0]
-        extrinsics = [self.rig[k].extrinsics for k in self.shown.of_cameras[best]]
-        rotations = self.given.rotations[best] @ np.array([one.axes for one in extrinsics])
-        centres = np.array([one.centre for one in extrinsics])
-        positions = self.given.positions[best] - np.einsum("gij,gj->gi", rotations, centres)
-        longest = max(one.camera.readout_time for one in self.rig) + 2.0 * float(beyond)
-        follow = following(self.times[best], rotations)
-        return initial_trajectory(self.times[best], rotations, positions, longest, follow)
+        """Return a spline through images with keypoints; those that follow are one stretch."""
+        used = np.unique(self.shown.images[self.used])
+        times, rotations = self.times[used], self.given.rotations[used]
+        follow = following(times, rotations)
+        positions, longest = self.given.positions[used], self.camera.readout_time
+        return initial_trajectory(times, rotations, positions, longest, follow)
 
     @property
     def tells_readout(self) -> bool:
@@ -164,37 +155,9 @@ class Refinement:
         own = self.times[np.unique(self.shown.images[self.used])]
         return int(np.bincount(self.spline.layout.stretches(own)).max())
 
-    def keypoints(self, camera: int) -> BoolArray:
-        """Return a mask (n,) of the used keypoints of a camera."""
-        return np.asarray(
-            self.used & (self.shown.of_cameras[self.shown.images] == camera), np.bool_
-        )
-
-    def _observations(self) -> list[SplineKeypoints]:
-        """Return the keypoints of each camera."""
-        every = []
-        for k, one in enumerate(self.rig):
-            used = self.keypoints(k)
-            images, pixels = self.shown.images[used], self.shown.pixels[used]
-            every.append(
-                SplineKeypoints(
-                    times=self.times[images],
-                    row_times=one.camera.row_time(pixels),
-                    pixels=pixels,
-                    landmarks=self.given.points,
-                    points=self.shown.landmarks[used],
-                    frames=images,
-                    trusted=np.ones(len(images), np.bool_),
-                )
-            )
-        return every
-
     def problem(self, freedom: Freedom, held: bool = False) -> Problem:
         """Return the problem of map and motion; ``held``: only the motion is free."""
-        views = [
-            CameraView(one.camera, own, replace(freedom, mounting=None if held else one.mounting))
-            for one, own in zip(self.rig, self.seen, strict=True)
-        ]
+        views = [CameraView(self.camera, self.seen, freedom)]
         if held:
             return Problem(views, self.state)
         return Problem(views, self.state, deviations=self.deviations, floating=self.floating)
@@ -215,15 +178,11 @@ class Refinement:
             done("accelerations")
         return self._result(problem, before, deviation)
 
-    def _of_all(self, name: str) -> NDArray[Any]:
-        """Return a field of the observations of all cameras, one after the other."""
-        return np.concatenate([getattr(own, name) for own in self.seen])
-
     def _result(self, problem: Problem, before: float, deviation: float) -> RefinedMap:
         state, count = self.state, len(self.state.landmarks)
         squared = problem.errors(state)
         inliers = squared < (LIMIT * deviation) ** 2
-        shown, frames = (self._of_all(name)[inliers] for name in ("points", "frames"))
+        shown, frames = self.seen.points[inliers], self.seen.frames[inliers]
         sights = np.bincount(shown, minlength=count)
         pairs = np.unique(np.column_stack([shown, frames]), axis=0)
         images = np.bincount(pairs[:, 0], minlength=count)
@@ -243,15 +202,17 @@ class Refinement:
             moved = np.linalg.norm(points - self.given.points, axis=1)
             refined &= spread < _WORTH * np.median(moved[refined])
         all_squared = np.full(len(self.used), np.inf)
-        ends = np.cumsum([len(own.points) for own in self.seen])[:-1]
-        for k, own in enumerate(np.split(squared, ends)):
-            all_squared[self.keypoints(k)] = own
+        all_squared[self.used] = squared
+        free = self.freedom.readout_time
         found = RefinedMap(
             points=np.where(refined[:, None], points, self.given.points),
             covariances=np.where(refined[:, None, None], covariances, np.nan),
             refined=refined,
             sights=sights,
-            cameras=self._cameras(problem, deviation, inflation, inflation * shared),
+            camera=self.camera,
+            readout_time=0.0,
+            readout_time_deviation=math.sqrt(inflation * shared[0, 0]) if free else math.nan,
+            readout_check=None if free else self._asked(deviation, inflation),
             deviation=deviation * math.sqrt(left_over(len(inliers), used)),
             squared_errors=all_squared,
             inliers=all_squared < (LIMIT * deviation) ** 2,
@@ -263,6 +224,7 @@ class Refinement:
             tells_readout=self.tells_readout,
             apart=self.wanted.apart,
         )
+        found = _as_in(found, state)
         return replace(found, drifts=self._drifts(found, problem, modes, whole))
 
     def _drifts(
@@ -276,20 +238,16 @@ class Refinement:
         drifts, still = [], np.zeros(3 * len(self.state.landmarks))
         for mode in modes.T:
             state = problem.moved(self.state, np.concatenate([mode, still]))
-            cameras = tuple(
-                _as_in(one, moved)
-                for one, moved in zip(found.cameras, problem.states(state), strict=True)
-            )
-            drifts.append(replace(found, spline=whole.moved(state.spline), cameras=cameras))
+            drifts.append(replace(_as_in(found, state), spline=whole.moved(state.spline)))
         return tuple(drifts)
 
     def _cluster_robust(self, problem: Problem, deviation: float, independent: float) -> float:
         """Return the inflation of the covariances by errors of a second that pull together."""
-        squared, every = problem.errors(self.state), problem.keypoint_rows(self.state, deviation)
-        rows = np.concatenate([np.dstack([of.values[..., -3:], of.errors]) for of in every])
+        squared, (seen,) = problem.errors(self.state), problem.keypoint_rows(self.state, deviation)
+        rows = np.dstack([seen.values[..., -3:], seen.errors])
         inside = squared[squared < (LIMIT * deviation) ** 2]
         held, own = self.deviations**-2.0, steepness(inside, deviation) ** 2
-        pull = pull_at_landmarks(rows, self._of_all("points"), self._of_all("times"), held)
+        pull = pull_at_landmarks(rows, self.seen.points, self.seen.times, held)
         own *= left_over(len(inside), self._freedoms(self.state.spline))
         return Pull(own * pull.measured, pull.expected).inflation(independent)
 
@@ -298,53 +256,24 @@ class Refinement:
 
         Those of a global shutter say nothing of what lies between them.
         """
-        images = sum(len(np.unique(own.frames)) for own in self.seen)
-        rolling = self.freedom.readout_time or any(
-            one.camera.readout_time > 0.0 for one in self.rig
-        )
+        images = len(np.unique(self.seen.frames))
+        rolling = self.freedom.readout_time or self.camera.readout_time > 0.0
         ends = len(spline.layout.starts) if rolling else 0
         return CONTROL * min(images + ends, len(spline.positions))
 
-    def _cameras(
-        self, problem: Problem, deviation: float, inflation: float, shared: Array
-    ) -> tuple[Adjusted, ...]:
-        """Return the cameras, with the covariance (s,s) of what all images share."""
-        asked, spread, found = self._asked(deviation, inflation), np.sqrt(np.diag(shared)), []
-        free = self.freedom.readout_time
-        for k, (one, wanted, state) in enumerate(
-            zip(self.rig, asked, problem.states(self.state), strict=True)
-        ):
-            own = np.zeros(EXTRINSICS)
-            if one.mounting is not None:
-                own = spread[problem.place("mount", k) :][:EXTRINSICS]
-            readout = float(spread[problem.place("readout", k)]) if free else math.nan
-            given = Adjusted(one.camera, 0.0, readout, wanted, state.extrinsics, own)
-            found.append(_as_in(given, state))
-        return tuple(found)
-
-    def _asked(self, deviation: float, inflation: float) -> list[ReadoutCheck | None]:
-        """Return readout times that images ask for instead of given ones, by a Newton step."""
-        known = [one.camera.readout_time > 0.0 for one in self.rig]
-        none: list[ReadoutCheck | None] = [None] * len(known)
-        if self.freedom.readout_time or not any(known) or not self.tells_readout:
-            return none
+    def _asked(self, deviation: float, inflation: float) -> ReadoutCheck | None:
+        """Return the readout time that images ask for instead of a given one, by a Newton step."""
+        given = self.camera.readout_time
+        if not given > 0.0 or not self.tells_readout:
+            return None
         problem = self.problem(replace(self.freedom, readout_time=True))
         try:
             factored = Factored(problem.system(self.state, deviation))
             step, variances = factored.step(), np.diag(factored.border_covariance())
         except Undetermined:
-            return none
-        given = [float(one.readout_time) for one in problem.states(self.state)]
-        return [
-            ReadoutCheck(
-                given[k],
-                given[k] + float(step[problem.at[k]["readout"]]),
-                math.sqrt(inflation * variances[problem.place("readout", k)]),
-            )
-            if known[k]
-            else None
-            for k in range(len(known))
-        ]
+            return None
+        asked = given + float(step[problem.groups.motion])
+        return ReadoutCheck(given, asked, math.sqrt(inflation * variances[0]))
 
 
 DRIFT = 0.01
@@ -357,14 +286,13 @@ _WORTH = 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RefinedMap:
+class RefinedMap(Adjusted):
     """Landmarks and motion, with the covariance of their errors."""
 
     points: Array  # (p,3) m
     covariances: Array  # (p,3,3) m^2; NaN where not refined
     refined: BoolArray  # (p,) others are where they were given
     sights: IntArray  # (p,) keypoints that fit
-    cameras: tuple[Adjusted, ...]  # with the readout times and the lenses that were found
     deviation: float  # px, of the noise of u and of v
     squared_errors: Array  # (n,) px^2, whitened; infinite for keypoints that took no part
     inliers: BoolArray  # (n,)
@@ -375,7 +303,7 @@ class RefinedMap:
     times: Array  # (g,) s, of the images' middle rows
     tells_readout: bool  # images follow each other closely enough to tell the readout time
     apart: bool = False  # each image has a pose of its own, of no common motion
-    # The motion and the cameras, off by DRIFT deviations of an error that landmarks share, each: as
+    # The motion and the camera, off by DRIFT deviations of an error that landmarks share, each: as
     # many as were asked for, the largest first, in frames of their own.
     drifts: tuple[RefinedMap, ...] = ()
 
@@ -383,26 +311,6 @@ class RefinedMap:
     def fit_share(self) -> float:
         """Share of the keypoints that fit."""
         return float(np.mean(self.inliers))
-
-    @property
-    def camera(self) -> Camera:
-        """The first one, with the readout time and the lens that were found."""
-        return self.cameras[0].camera
-
-    @property
-    def readout_time(self) -> float:
-        """The first camera's readout time, s; negative: against the scan direction."""
-        return self.cameras[0].readout_time
-
-    @property
-    def readout_time_deviation(self) -> float:
-        """The first camera's deviation, s; NaN where it was given."""
-        return self.cameras[0].readout_time_deviation
-
-    @property
-    def readout_check(self) -> ReadoutCheck | None:
-        """The first camera's check."""
-        return self.cameras[0].readout_check
 
     @property
     def camera_as_found(self) -> Camera:
@@ -413,7 +321,7 @@ class RefinedMap:
         return replace(self.camera, scan_direction=direction)
 
     def poses(self) -> tuple[Array, Array]:
-        """Return poses of the rig's axes in the map (g,3,3), (g,3) at the images' middle rows."""
+        """Return poses map_from_camera (g,3,3), (g,3) at the images' middle rows."""
         states = self.spline.states(self.times)
         return states.rotations, states.positions
 
@@ -427,50 +335,33 @@ def refine(
     stamp_offset: float = 0.0,
     done: Callable[[str], object] = lambda text: None,
 ) -> RefinedMap:
-    """Return the most likely map and motion, as of :func:`refine_rig`.
+    """Return the most likely map and motion.
 
     Args:
         camera: its lens, scan direction and readout time (0: a global shutter).
-        stamp_offset: s from a stamp to the first row's exposure.
-    """
-    return refine_rig([RigCamera(camera, stamp_offset)], seen, start, freedom, done=done)
-
-
-def refine_rig(
-    rig: Sequence[RigCamera],
-    seen: MapObservations,
-    start: Start,
-    freedom: MapFreedom | None = None,
-    *,
-    done: Callable[[str], object] = lambda text: None,
-) -> RefinedMap:
-    """Return the most likely map and motion of a rig.
-
-    Args:
-        rig: its cameras.
         seen: keypoints of landmarks; those of landmarks that one image alone sees do not count.
         start: first guess; without landmarks of known places the map as a whole, its size too,
             stays where this has it.
         freedom: further unknowns (default: landmarks and motion only).
+        stamp_offset: s from a stamp to the first row's exposure.
         done: called with each part of the work that is done.
 
     Raises:
         ValueError: when the images make no single map, or are too many.
     """
-    freedom = freedom or MapFreedom()
-    check(seen, len(start.points), np.array([one.delay for one in rig]))
-    refinement = Refinement(rig, seen, start, freedom)
+    check(seen, len(start.points))
+    refinement = Refinement(camera, stamp_offset, seen, start, freedom or MapFreedom())
     try:
         return refinement.solved(done)
     except Undetermined as error:
         raise ValueError(f"the map cannot be refined: {error}") from error
 
 
-def _as_in(one: Adjusted, state: Unknowns) -> Adjusted:
-    """Return a camera with the lens, the readout time and the extrinsics of a state."""
+def _as_in(one: RefinedMap, state: Unknowns) -> RefinedMap:
+    """Return a map whose camera has the lens and the readout time of a state."""
     readout_time = float(state.readout_time)
     camera = with_lens(replace(one.camera, readout_time=abs(readout_time)), state.lens)
-    return replace(one, camera=camera, readout_time=readout_time, extrinsics=state.extrinsics)
+    return replace(one, camera=camera, readout_time=readout_time)
 
 
 def _laid(

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Poses of markers, from recordings that show them, by one camera or by the cameras of a rig.
+"""Poses of markers, from a recording that shows them.
 
 Continuous-time adjustment with the poses of the markers free, each a rigid square of known size.
 The first marker is the origin; whatever shows several of them closes loops.
@@ -14,30 +14,29 @@ its own, and compared.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.camera import Camera
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
 from rs_localizer.tools.adjust.bodies import BODY, PLACE
 from rs_localizer.tools.adjust.cluster_robust import by_seconds, cluster_robust
-from rs_localizer.tools.adjust.fit import Fit, solve
+from rs_localizer.tools.adjust.fit import Fit, fit
 from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.reprojection import LIMIT
-from rs_localizer.tools.adjust.row_kernels import EXTRINSICS
-from rs_localizer.tools.adjust.spline import Spline
 from rs_localizer.tools.adjust.system import System, Undetermined
 from rs_localizer.tools.adjust.variables import (
     CameraView,
     Freedom,
     SplineKeypoints,
     Unknowns,
-    rig_state,
+    start_state,
 )
 from rs_localizer.tools.mapping.gauge import of_the_shape, through
 from rs_localizer.tools.mapping.initial_trajectory import (
@@ -46,13 +45,8 @@ from rs_localizer.tools.mapping.initial_trajectory import (
     acceleration_prior,
     initial_trajectory,
 )
-from rs_localizer.tools.mapping.map_keypoints import Adjusted, RigImages, frames_of
-from rs_localizer.tools.mapping.unknown_markers import (
-    Chained,
-    Filmed,
-    Spotted,
-    chain,
-)
+from rs_localizer.tools.mapping.map_keypoints import Adjusted
+from rs_localizer.tools.mapping.unknown_markers import Chained, Filmed, chain
 from rs_localizer.tools.readout_belief import ReadoutCheck, disagreement
 
 # Steps of Gauss and Newton, and the noise of each by what it is.
@@ -62,58 +56,14 @@ _NOISES = (10.0,) * 6 + (1.0,) * 4
 _LEAST_DIFFERENCE = 12.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Adjustable:
-    """Keypoints of the cameras: four corners of each marker; the first, the origin, is known."""
-
-    filmed: Sequence[Filmed]
-    seen: Sequence[SplineKeypoints]  # of the landmarks that all see
-
-    def start(self, spline: Spline) -> Unknowns:
-        """Return a first guess."""
-        pairs = zip(self.filmed, self.seen, strict=True)
-        return rig_state(spline, ((one.camera, own, one.extrinsics) for one, own in pairs))
-
-    def problem(
-        self,
-        start: Unknowns,
-        freedom: Freedom,
-        readout_times: bool = False,
-        markers_only: bool = False,
-    ) -> Problem:
-        """Return the problem of all cameras.
-
-        Args:
-            freedom: of the motion.
-            readout_times: those that are given are estimated, too.
-            markers_only: nothing but the markers is free, the origin as well.
-        """
-        bodies = None
-        if markers_only:
-            bodies = np.repeat(np.arange(len(start.landmarks) // 4), 4)
-        views = []
-        for one, seen in zip(self.filmed, self.seen, strict=True):
-            own = replace(
-                freedom,
-                readout_time=not markers_only
-                and (readout_times or not one.camera.readout_time > 0.0),
-                mounting=None if markers_only else one.mounting,
-            )
-            seen = seen if bodies is None else replace(seen, bodies=bodies)
-            views.append(CameraView(one.camera, seen, own))
-        return Problem(views, start, one_map=True)
-
-    def fit_roughly(self, start: Unknowns, freedom: Freedom, *free: bool) -> Fit:
-        """Fit from far off, as at the end of a chain, where large errors are no outliers."""
-        errors = np.sqrt(self.problem(start, freedom, *free).errors(start))
-        return self.fit(start, freedom, float(np.clip(np.median(errors), *_FIRST_NOISE)), *free)
-
-    def fit(self, start: Unknowns, freedom: Freedom, deviation: float, *free: bool) -> Fit:
-        """Return the minimum of a problem."""
-        return solve(self.problem(start, freedom, *free), start, deviation)
+def _problem(camera: Camera, seen: SplineKeypoints, fitted: Fit) -> Problem:
+    """Return the problem whose minimum a fit is."""
+    return Problem([CameraView(camera, seen, fitted.freedom)], fitted.state)
 
 
-def _mirrored(given: Adjustable, fitted: Fit) -> tuple[BoolArray, BoolArray, Unknowns]:
+def _mirrored(
+    camera: Camera, seen: SplineKeypoints, fitted: Fit
+) -> tuple[BoolArray, BoolArray, Unknowns]:
     """Compare each marker with its mirror image, the motion held.
 
     Returns:
@@ -122,8 +72,10 @@ def _mirrored(given: Adjustable, fitted: Fit) -> tuple[BoolArray, BoolArray, Unk
     """
     count = len(fitted.state.landmarks) // 4
     # The origin, too, may lie the other way among all others.
-    problem = given.problem(fitted.state, fitted.freedom, markers_only=True)
-    other = fitted.state.with_landmarks(_turned_over(given.seen, fitted.state))
+    every = replace(seen, bodies=np.repeat(np.arange(count), 4))
+    free = replace(fitted.freedom, readout_time=False)
+    problem = Problem([CameraView(camera, every, free)], fitted.state)
+    other = replace(fitted.state, landmarks=_turned_over(seen, fitted.state))
     for noise in _NOISES:
         system = problem.system(other, noise * fitted.deviation)
         still = np.zeros(problem.groups.motion)
@@ -140,17 +92,14 @@ def _mirrored(given: Adjustable, fitted: Fit) -> tuple[BoolArray, BoolArray, Unk
     return better & ~same, doubtful & ~same, _at_the_origin(fitted.state, chosen)
 
 
-def _turned_over(every: Sequence[SplineKeypoints], state: Unknowns) -> Array:
+def _turned_over(seen: SplineKeypoints, state: Unknowns) -> Array:
     """Return corners (p,3) of each marker mirrored in depth as its images see it."""
     layout, corners = state.spline.layout, state.landmarks.reshape(-1, 4, 3)
-    middles, sight = corners.mean(axis=1), np.zeros((len(corners), 3))
-    for seen, own in zip(every, (state, *state.others), strict=True):
-        times = np.clip(seen.times, layout.starts.min(), layout.ends.max())
-        states, markers = state.spline.states(times), seen.points // 4
-        centres = states.positions + states.rotations @ own.extrinsics.centre
-        toward: Array = centres - middles[markers]
-        toward /= np.linalg.norm(toward, axis=1)[:, None]
-        sight += np.column_stack([np.bincount(markers, of, len(corners)) for of in toward.T])
+    middles, markers = corners.mean(axis=1), seen.points // 4
+    times = np.clip(seen.times, layout.starts.min(), layout.ends.max())
+    toward: Array = state.spline.states(times).positions - middles[markers]
+    toward /= np.linalg.norm(toward, axis=1)[:, None]
+    sight = np.column_stack([np.bincount(markers, of, len(corners)) for of in toward.T])
     sight /= np.maximum(np.linalg.norm(sight, axis=1), 1e-12)[:, None]
     depth = np.einsum("mci,mi->mc", corners - middles[:, None], sight)
     return np.asarray(corners - 2.0 * depth[..., None] * sight[:, None]).reshape(-1, 3)
@@ -169,7 +118,7 @@ def _costs(problem: Problem, state: Unknowns, deviation: float) -> Array:
     limit = (LIMIT * deviation) ** 2
     rest = np.maximum(1.0 - problem.errors(state) / limit, 0.0)
     costs = (1.0 - rest**3) * limit / (3.0 * deviation**2)
-    points = np.concatenate([view.observations.points for view in problem.views])
+    points = problem.views[0].observations.points
     return np.asarray(np.bincount(points // 4, costs, len(state.landmarks) // 4), np.float64)
 
 
@@ -185,17 +134,9 @@ def _at_the_origin(state: Unknowns, landmarks: Array) -> Unknowns:
     back = through(landmarks[:4], state.landmarks[:4])
     moved = back(landmarks)
     moved[:4] = state.landmarks[:4]
-    return replace(state, spline=back.moved(state.spline)).with_landmarks(moved)
+    return replace(state, spline=back.moved(state.spline), landmarks=moved)
 
 
-# Relative deviation of a size of which nothing is known.
-_ANY_SIZE = 0.5
-# A size is wrong beyond this and this many of its own deviations (printers stretch by up to three
-# parts in a thousand, rulers are read to half a millimetre).
-_SIZES_DIFFER, _SIGMAS = 0.015, 6.0
-# The least noise (px) from far off on, where a wrong size makes no outliers, to the last one; and
-# rounds at each, until sizes change by less than a part.
-_FROM_FAR, _MOST_ROUNDS, _SAME_SIZE = (5.0, 1.0, 0.2), 5, 0.005
 _LEAST_IMAGES = 5
 # Images that show a marker: fewer say hardly anything of it.
 _LEAST_SIGHTS = 3
@@ -228,8 +169,8 @@ class Survey:
     rare: tuple[Marker, ...]
     misfits: tuple[Marker, ...]  # whose corners do not fit those of the others, left out
     fit: Fit
-    cameras: tuple[Adjusted, ...]
-    images: tuple[int, ...]  # of each camera, that show markers of the map
+    shutter: Adjusted
+    images: int  # that show markers of the map
 
     @property
     def deviations(self) -> Array:
@@ -248,36 +189,27 @@ class Survey:
         return np.sqrt(np.diagonal(self.covariance_of_shape)).reshape(-1, BODY)
 
 
-def survey(
-    filmed: Sequence[Filmed], markers: Sequence[Marker], *, origin: int | None = None
-) -> Survey:
-    """Survey the markers that a camera or a rig shows; cameras need not see the same ones.
+def survey(filmed: Filmed, markers: Sequence[Marker], *, origin: int | None = None) -> Survey:
+    """Survey the markers that a camera shows.
 
     Args:
-        filmed: by each camera; the motion is that of the rig's axes.
+        filmed: the images.
         markers: all that may be there, by their sizes; where they are does not matter.
         origin: place of the marker whose frame is the map's; None: the first one.
 
     Raises:
         ValueError: when the images say too little, or markers fit no others, with what was found.
     """
-    filmed = [
-        replace(one, spotted=[image for image in one.spotted if len(image.markers)])
-        for one in filmed
-    ]
-    images = [image for one in filmed for image in one.spotted]
-    _check(images, markers, origin)
-    start_ns = min(image.stamp_ns for image in images)
-    times = [one.times(start_ns) for one in filmed]
-    frames = frames_of(times)
-    chained = chain(filmed, frames, markers, origin)
+    filmed = replace(filmed, spotted=[image for image in filmed.spotted if len(image.markers)])
+    _check(filmed, markers, origin)
+    chained = chain(filmed, markers, origin)
     if len(chained.markers) < 2:
         raise ValueError(
             f"no image shows {markers[next(iter(chained.markers))].name} together with another "
             "marker: there is nothing to survey"
         )
     try:
-        done = _adjusted(filmed, times, frames, markers, chained)
+        done = _adjusted(filmed, markers, chained)
     except Undetermined as error:
         raise ValueError(f"the images do not determine the markers' poses: {error}") from error
     if isinstance(done, Survey):
@@ -287,62 +219,54 @@ def survey(
     if origin in done or len(chained.markers) - len(lost) < 2:
         names = ", ".join(marker.name for marker in lost)
         raise ValueError(f"{names}: the corners do not fit those of other markers: {MISFIT}")
-    rest = [replace(one, spotted=[image.without(done) for image in one.spotted]) for one in filmed]
+    rest = replace(filmed, spotted=[image.without(done) for image in filmed.spotted])
     found = survey(rest, markers, origin=origin)
     return replace(found, misfits=lost + found.misfits)
 
 
-def _check(images: list[Spotted], markers: Sequence[Marker], origin: int | None) -> None:
-    if len(images) < _LEAST_IMAGES:
+def _check(filmed: Filmed, markers: Sequence[Marker], origin: int | None) -> None:
+    if len(filmed.spotted) < _LEAST_IMAGES:
         raise ValueError(
-            f"{len(images)} images show a whole marker, at least {_LEAST_IMAGES} are needed"
+            f"{len(filmed.spotted)} images show a whole marker, at least {_LEAST_IMAGES} are needed"
         )
-    if origin is not None and not any(origin in one.markers for one in images):
+    if origin is not None and not any(origin in one.markers for one in filmed.spotted):
         raise ValueError(f"the origin, {markers[origin].name}, is in no image")
 
 
-def _adjusted(
-    filmed: Sequence[Filmed], times: Sequence[Array], frames: Sequence[RigImages],
-    markers: Sequence[Marker], chained: Chained,
-) -> Survey | list[int]:  # fmt: skip
+def _adjusted(filmed: Filmed, markers: Sequence[Marker], chained: Chained) -> Survey | list[int]:
     """Return the survey, or the markers that do not fit the others."""
-    posed = [frames[k] for k in chained.frames]
-    shown = [sorted(image for frame in posed for camera, image in frame.images if camera == place)
-             for place in range(len(filmed))]  # fmt: skip
-    own = _often(filmed, shown, chained)
-    sizes, guessed = (np.array([of[m].size for m in own]) for of in (markers, chained.sized))
-    spline = _first_motion(filmed, times, posed, chained)
-    seen = []
-    for one, images, own_times in zip(filmed, shown, times, strict=True):
-        found = _observations(one, images, own_times, markers, chained, own)
-        seen.append(found.subset(spline.layout.inside(found.times)))
-    given = Adjustable(filmed, seen)
+    own, camera, times = _often(filmed, chained), filmed.camera, filmed.times()
+    rotations = np.array([pose.rotation for pose in chained.poses])
+    positions = np.array([pose.translation for pose in chained.poses])
+    spline = initial_trajectory(times[chained.images], rotations, positions, camera.readout_time)
+    seen = _observations(filmed, times, markers, chained, own)
+    seen = seen.subset(spline.layout.inside(seen.times))
     freedom = Freedom(
+        readout_time=not camera.readout_time > 0.0,
         angular_velocity=ANGULAR_VELOCITY,
         linear_velocity=LINEAR_VELOCITY,
         least_noise=_LEAST_NOISE,
     )
-    start = given.start(spline)
-    grown = _grown(given, start, freedom, np.log(guessed / sizes))
-    if grown.any():
-        raise ValueError(_wrong_sizes([markers[m] for m in own], grown))
-    fitted = given.fit_roughly(start, freedom)
+    start = start_state(camera, seen, spline, camera.readout_time)
+    # Far off, as at the end of a chain, large errors are no outliers.
+    errors = np.sqrt(Problem([CameraView(camera, seen, freedom)], start).errors(start))
+    first = float(np.clip(np.median(errors), *_FIRST_NOISE))
+    fitted = fit(camera, seen, start, freedom, first)
     calmer = acceleration_prior(fitted.state, freedom)
     if calmer is not None:
-        fitted = given.fit(fitted.state, calmer, fitted.deviation)
-    fitted, doubtful = _right_side_up(given, fitted)
-    fitted = _less_noise(given, fitted)
+        fitted = fit(camera, seen, fitted.state, calmer, fitted.deviation)
+    fitted, doubtful = _right_side_up(camera, seen, fitted)
+    fitted = _less_noise(camera, seen, fitted)
     _check_fit(fitted)
-    fits, misfits = _fitting(posed, seen, fitted.inliers, len(own))
+    fits, misfits = _fitting(seen, fitted.inliers, len(own))
     if misfits.any():
         return [own[k] for k in np.flatnonzero(misfits)]
-    fitted = cluster_robust(given.problem(fitted.state, fitted.freedom), fitted)
+    fitted = cluster_robust(_problem(camera, seen, fitted), fitted)
     corners = fitted.state.landmarks.reshape(-1, 4, 3)
     placed = [
         Marker(markers[m].family, markers[m].id, of) for m, of in zip(own, corners, strict=True)
     ]
-    points = np.concatenate([each.points for each in seen])[fitted.inliers]
-    counts = np.bincount(points // 4, minlength=len(own)) // 4
+    counts = np.bincount(seen.points[fitted.inliers] // 4, minlength=len(own)) // 4
     known = np.flatnonzero(fits & (counts >= _LEAST_SIGHTS) & ~doubtful)
     order = [0, *sorted(known[known > 0].tolist(), key=lambda k: own[k])]
     covariance = _covariance(fitted, order)
@@ -355,44 +279,28 @@ def _adjusted(
         tuple(markers[m] for m in chained.markers if m not in {own[k] for k in order}),
         (),
         fitted,
-        tuple(_cameras(given, fitted)),
-        tuple(map(len, shown)),
+        _shutter(camera, seen, fitted),
+        len(chained.images),
     )
     _check_places(done)
     return done
 
 
-def _first_motion(
-    filmed: Sequence[Filmed], times: Sequence[Array], posed: Sequence[RigImages], chained: Chained
-) -> Spline:
-    """Return a spline through the frames with a pose."""
-    rotations = np.array([pose.rotation for pose in chained.poses])
-    positions = np.array([pose.translation for pose in chained.poses])
-    # Images of a frame reach beyond its middle.
-    beyond = max(
-        abs(times[camera][image] - frame.time) for frame in posed for camera, image in frame.images
-    )
-    longest = max(one.camera.readout_time for one in filmed) + 2.0 * float(beyond)
-    return initial_trajectory(
-        np.array([frame.time for frame in posed]), rotations, positions, longest
-    )
-
-
-def _right_side_up(given: Adjustable, fitted: Fit) -> tuple[Fit, BoolArray]:
+def _right_side_up(camera: Camera, seen: SplineKeypoints, fitted: Fit) -> tuple[Fit, BoolArray]:
     """Turn all markers as they fit best; return also a mask (m,) of undecided ones."""
     for _ in range(_MOST_TURNS):
-        better, doubtful, other = _mirrored(given, fitted)
+        better, doubtful, other = _mirrored(camera, seen, fitted)
         if not better.any():
             break
-        turned = given.fit(other, fitted.freedom, fitted.deviation)
-        problem = given.problem(fitted.state, fitted.freedom)
-        if problem.system(turned.state, fitted.deviation).cost > fitted.cost:
+        turned = fit(camera, seen, other, fitted.freedom, fitted.deviation)
+        system = _problem(camera, seen, fitted).system(turned.state, fitted.deviation)
+        if system.cost > fitted.cost:
             break
         fitted = turned
     return fitted, doubtful
 
 
-def _less_noise(given: Adjustable, fitted: Fit) -> Fit:
+def _less_noise(camera: Camera, seen: SplineKeypoints, fitted: Fit) -> Fit:
     """Fit again with corners that are better than was assumed.
 
     If they weigh too little, the prior of the accelerations wins, and the readout time suffers.
@@ -400,7 +308,7 @@ def _less_noise(given: Adjustable, fitted: Fit) -> Fit:
     noise = fitted.deviation * math.sqrt(fitted.inflation)
     if fitted.deviation > _LEAST_NOISE or noise > _LEAST_NOISE:
         return fitted
-    return given.fit(fitted.state, replace(fitted.freedom, least_noise=noise), noise)
+    return fit(camera, seen, fitted.state, replace(fitted.freedom, least_noise=noise), noise)
 
 
 def _covariance(fitted: Fit, order: list[int]) -> Array:
@@ -413,127 +321,18 @@ def _covariance(fitted: Fit, order: list[int]) -> Array:
     return covariance
 
 
-def _grown(given: Adjustable, start: Unknowns, freedom: Freedom, grown: Array) -> Array:
-    """Return log sizes (m,) over the given ones, for markers whose size certainly differs.
-
-    All sizes free at once would drift along a chain of markers by what errors have in common, which
-    costs each of them next to nothing. So most are held, and one at a time is let go; and readout
-    times are free, lest a wrong one is taken for sizes.
-
-    Args:
-        start: with sizes as they are said to be.
-        grown: (m,) a first guess.
-    """
-    far = replace(freedom, least_noise=_FROM_FAR[0])
-    fitted = given.fit_roughly(_resized(start, grown), far, True)
-    for noise in (*_FROM_FAR, _LEAST_NOISE):
-        for _ in range(_MOST_ROUNDS):
-            if grown.any():
-                fitted = _right_side_up(given, fitted)[0]
-            own = replace(freedom, least_noise=noise)
-            fitted = given.fit(fitted.state, own, fitted.deviation, True)
-            more = _least_growth(given, fitted, grown) - grown
-            grown = grown + more
-            fitted = replace(fitted, state=_resized(fitted.state, more))
-            if np.abs(more).max() < _SAME_SIZE:
-                break
-    shown = np.concatenate([each.points for each in given.seen]) // 4
-    share = np.bincount(shown, fitted.inliers, len(grown)) / np.bincount(shown)
-    grown = np.where(share < _LEAST_FIT, 0.0, grown)  # no size explains those
-    # The costs are compared, too: weights of Tukey's estimator hide evidence against a size.
-    for k in np.argsort(np.abs(grown))[np.count_nonzero(grown == 0.0) :].tolist():
-        less = np.where(np.arange(len(grown)) == k, 0.0, grown)
-        plain = given.fit(_resized(fitted.state, less - grown), freedom, fitted.deviation, True)
-        if not _cheaper(given, fitted, plain):
-            fitted, grown = plain, less
-    if grown.any() and not _cheaper(given, fitted, given.fit_roughly(start, freedom, True)):
-        grown = np.zeros(len(grown))
-    return grown
-
-
-def _cheaper(given: Adjustable, sized: Fit, plain: Fit) -> bool:
-    """Return True if one more size certainly lowers the cost."""
-    problem = given.problem(plain.state, plain.freedom, True)
-    gain = problem.system(plain.state, sized.deviation).cost - sized.cost
-    return bool(gain > _SIGMAS**2 * cluster_robust(problem, plain).inflation)
-
-
-def _least_growth(given: Adjustable, fitted: Fit, grown: Array) -> Array:
-    """Return the log sizes of the few markers that lower the cost most.
-
-    One by one the size is freed that lowers the cost most (orthogonal matching pursuit; Pati et
-    al., Asilomar 1993), while it does so certainly.
-
-    Args:
-        grown: (m,) the same of the fit.
-    """
-    problem = given.problem(fitted.state, fitted.freedom, True)
-    noise = cluster_robust(problem, fitted).inflation
-    corners, count = fitted.state.landmarks.reshape(-1, 4, 3), len(grown)
-    arms = (corners - corners.mean(axis=1, keepdims=True)).reshape(-1, 3)
-    kept, own = np.zeros((problem.groups.kept, count)), np.zeros((count, count))
-    slope = np.zeros(count)
-    every = problem.keypoint_rows(fitted.state, fitted.deviation)
-    for rows, seen in zip(every, given.seen, strict=True):
-        by_place = rows.values[:, :, -BODY : PLACE - BODY]
-        values = np.einsum("nri,ni->nr", by_place, arms[seen.points]).ravel()
-        columns, starts = np.repeat(seen.points // 4, 2), np.arange(len(values) + 1)
-        by_size = csr_array((values, columns, starts), shape=(len(values), count))
-        kept += (rows.matrix(slice(None), len(kept)).T @ by_size).toarray()
-        own += (by_size.T @ by_size).toarray()
-        slope += by_size.T @ rows.errors.ravel()
-    information = own - kept.T @ fitted.factored.kept(kept)
-    slope += kept.T @ fitted.factored.step() - information @ grown
-    found, chosen = np.zeros(count), list[int]()
-    single = np.maximum(np.diag(information), _ANY_SIZE**-2)
-    while len(chosen) < count // 2:
-        off = -(slope + information @ found) / single
-        gains = np.where(np.abs(off) > _SIZES_DIFFER, single * off**2, 0.0)
-        gains[chosen] = 0.0
-        if gains.max() < _SIGMAS**2 * noise:
-            break
-        chosen.append(int(np.argmax(gains)))
-        found[chosen] = -np.linalg.solve(information[np.ix_(chosen, chosen)], slope[chosen])
-    return found
-
-
-def _resized(state: Unknowns, grown: Array) -> Unknowns:
-    """Return the state with markers larger by factors of these logarithms (m,)."""
-    corners = state.landmarks.reshape(-1, 4, 3)
-    middles = corners.mean(axis=1, keepdims=True)
-    larger = middles + np.exp(grown)[:, None, None] * (corners - middles)
-    return state.with_landmarks(larger.reshape(-1, 3))
-
-
-def _wrong_sizes(said: Sequence[Marker], grown: Array) -> str:
-    """Name markers whose size disagrees with most, and the sizes that would fit."""
-    listed = [
-        f"{said[k].name} {said[k].size * np.exp(grown[k]):.4f} m (given {said[k].size:.4g})"
-        for k in np.flatnonzero(grown).tolist()
-    ]
-    return (
-        f"{len(listed)} of {len(said)} markers disagree with the others about metres; these "
-        f"sizes would fit: {', '.join(listed)}: measure them, and give --size ID:M for "
-        "those that differ"
-    )
-
-
-def _fitting(
-    posed: Sequence[RigImages], seen: Sequence[SplineKeypoints], inliers: BoolArray, count: int
-) -> tuple[BoolArray, BoolArray]:
-    """Return masks (m,) of markers connected by fitting frames, and of those that do not fit.
+def _fitting(seen: SplineKeypoints, inliers: BoolArray, count: int) -> tuple[BoolArray, BoolArray]:
+    """Return masks (m,) of markers connected by fitting images, and of those that do not fit.
 
     Two walls of which each fits by itself, and no image that shows both, are not one map.
     """
-    number = {image: k for k, frame in enumerate(posed) for image in frame.images}
-    pairs = [(camera, k) for camera, each in enumerate(seen) for k in each.frames.tolist()]
-    markers = np.concatenate([each.points for each in seen]) // 4
-    cells = len(posed) * markers + np.array([number[pair] for pair in pairs], np.int64)
-    corners, fit = (
-        np.bincount(cells, weights, count * len(posed)).reshape(count, -1)
-        for weights in (None, inliers)
+    images: IntArray = np.unique(seen.frames, return_inverse=True)[1]
+    total = int(images.max()) + 1
+    cells = total * (seen.points // 4) + images
+    corners, fit_corners = (
+        np.bincount(cells, weights, count * total).reshape(count, -1) for weights in (None, inliers)
     )
-    shown, whole = corners > 0, (corners > 0) & (fit == corners)
+    shown, whole = corners > 0, (corners > 0) & (fit_corners == corners)
     most = 2 * whole.sum(axis=1) > shown.sum(axis=1)
     whole &= most[:, None]
     together = whole.astype(float) @ whole.T
@@ -563,59 +362,36 @@ def _check_places(survey: Survey) -> None:
         )
 
 
-def _cameras(given: Adjustable, fitted: Fit) -> Iterator[Adjusted]:
-    """Yield the cameras, with the readout times that corners ask for instead of given ones."""
-    problem, asked = given.problem(fitted.state, fitted.freedom), fitted
-    if any(one.camera.readout_time > 0.0 for one in given.filmed):
-        asked = given.fit(fitted.state, fitted.freedom, fitted.deviation, True)
-        asked = cluster_robust(given.problem(asked.state, asked.freedom, True), asked)
-    free = given.problem(asked.state, asked.freedom, True)
-    for place, one in enumerate(given.filmed):
-        state, wanted = ((fit.state, *fit.state.others)[place] for fit in (fitted, asked))
-        known = one.camera.readout_time > 0.0
-        at = free.place("readout", place)
-        apart = disagreement(*by_seconds(free, asked, at))
-        deviation = apart * math.sqrt(asked.border_covariance[at, at])
-        deviations = np.zeros(EXTRINSICS)
-        if one.mounting is not None:
-            at = problem.place("mount", place)
-            deviations = np.sqrt(np.diag(fitted.border_covariance)[at:][:EXTRINSICS])
-        yield Adjusted(
-            one.camera,
-            state.readout_time,
-            math.nan if known else deviation,
-            ReadoutCheck(one.camera.readout_time, wanted.readout_time, deviation)
-            if known
-            else None,
-            state.extrinsics,
-            deviations,
-        )
+def _shutter(camera: Camera, seen: SplineKeypoints, fitted: Fit) -> Adjusted:
+    """Return the camera, with the readout time that corners ask for instead of a given one."""
+    asked, known = fitted, camera.readout_time > 0.0
+    if known:
+        free = replace(fitted.freedom, readout_time=True)
+        asked = fit(camera, seen, fitted.state, free, fitted.deviation)
+        asked = cluster_robust(_problem(camera, seen, asked), asked)
+    problem = _problem(camera, seen, asked)
+    apart = disagreement(*by_seconds(problem, asked, problem.place("readout")))
+    deviation, wanted = apart * asked.readout_time_deviation, asked.state.readout_time
+    if not known:
+        return Adjusted(camera, wanted, deviation, None)
+    check = ReadoutCheck(camera.readout_time, wanted, deviation)
+    return Adjusted(camera, camera.readout_time, math.nan, check)
 
 
-def _often(filmed: Sequence[Filmed], shown: Sequence[list[int]], chained: Chained) -> list[int]:
+def _often(filmed: Filmed, chained: Chained) -> list[int]:
     """Return the origin first, then the other markers that enough images show."""
-    counts: dict[int, int] = dict.fromkeys(chained.markers, 0)
-    for one, images in zip(filmed, shown, strict=True):
-        for k in images:
-            for marker in one.spotted[k].markers.tolist():
-                if marker in counts:
-                    counts[marker] += 1
+    shown = np.concatenate([filmed.spotted[k].markers for k in chained.images])
     origin, *others = chained.markers
-    return [origin, *(marker for marker in others if counts[marker] >= _LEAST_SIGHTS)]
+    return [origin, *(m for m in others if np.count_nonzero(shown == m) >= _LEAST_SIGHTS)]
 
 
 def _observations(
-    filmed: Filmed, images: list[int], times: Array, markers: Sequence[Marker], chained: Chained,
-    own: list[int],
-) -> SplineKeypoints:  # fmt: skip
-    """Return all corners of some images of a camera.
-
-    Args:
-        times: (g,) s, of all images.
-    """
+    filmed: Filmed, times: Array, markers: Sequence[Marker], chained: Chained, own: list[int]
+) -> SplineKeypoints:
+    """Return all corners of some markers in the images with a pose, taken at times (g,), s."""
     place = {marker: k for k, marker in enumerate(own)}
-    frames, points, pixels = [], [], [np.zeros((0, 2))]
-    for k in images:
+    frames, points, pixels = [], [], []
+    for k in chained.images:
         spotted = filmed.spotted[k]
         for marker, quad in zip(spotted.markers.tolist(), spotted.quads, strict=True):
             if marker in place:

@@ -9,9 +9,8 @@ agrees for the true poses only; by what agrees most, all are chained.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
 
@@ -20,15 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.camera import Camera
 from rs_localizer.io.transforms import Transform
-from rs_localizer.markers.detection import Detections, MarkerDetector
+from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.families import LEAST_SIDE, Family
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
-from rs_localizer.tools.mapping.map_keypoints import RigCamera, RigImages
+from rs_localizer.tools.mapping.map_keypoints import middle_row_delay
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,17 +77,12 @@ class Spotter:
     def spot(self, image: NDArray[np.uint8], stamp_ns: int) -> Spotted:
         """Return the markers of an image (h,w)."""
         found = self._detector.detect(image, stamp_ns)
-        whole = _whole_markers(found, self._end)
-        quads = [found.pixels[rows] for rows in whole.values()]
-        return Spotted(stamp_ns, np.array(list(whole), np.int64), np.array(quads).reshape(-1, 4, 2))
-
-
-def _whole_markers(detections: Detections, end: int) -> dict[int, IntArray]:
-    """Return rows of the detections for each single marker of which all four corners were found."""
-    place = {int(id_): row for row, id_ in enumerate(detections.ids) if id_ < end}
-    markers = sorted({id_ // 4 for id_ in place})
-    corners = {m: [place.get(4 * m + k, -1) for k in range(4)] for m in markers}
-    return {m: np.array(rows) for m, rows in corners.items() if min(rows) >= 0}
+        place = {int(id_): row for row, id_ in enumerate(found.ids) if id_ < self._end}
+        every = {id_ // 4 for id_ in place}
+        whole = sorted(m for m in every if all(4 * m + k in place for k in range(4)))
+        rows = np.array([[place[4 * m + k] for k in range(4)] for m in whole], np.int64)
+        quads = found.pixels[rows.reshape(-1)].reshape(-1, 4, 2)
+        return Spotted(stamp_ns, np.array(whole, np.int64), quads)
 
 
 # Images of a pair that are compared, evenly chosen.
@@ -104,191 +100,116 @@ _NEAR = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Filmed(RigCamera):
-    """The images of one of the cameras."""
+class Filmed:
+    """The images of a camera."""
 
-    spotted: Sequence[Spotted] = ()  # in the order of their stamps
+    camera: Camera  # its readout time: 0: a global shutter, or it is to be found
+    spotted: Sequence[Spotted]  # in the order of their stamps
+    stamp_offset: float = 0.0  # s from a stamp to the first row's exposure
 
-    def times(self, start_ns: int) -> Array:
-        """Return the times (g,), s, at which the images' middle rows were exposed."""
+    def times(self) -> Array:
+        """Return the times (g,), s since the first stamp, of the images' middle rows."""
+        start_ns = self.spotted[0].stamp_ns
         stamps = np.array([(image.stamp_ns - start_ns) * 1e-9 for image in self.spotted])
-        return stamps + self.delay
+        return stamps + middle_row_delay(self.camera, self.stamp_offset)
 
 
 @dataclass(frozen=True, slots=True)
 class Chained:
-    """Markers that hang together, and the frames that show them."""
+    """Markers that hang together, and the images that show them."""
 
-    sized: Sequence[Marker]  # all, with sizes to begin with where those that are said cannot be
     markers: dict[int, Transform]  # origin_from_marker, by place in the list
-    frames: list[int]  # places of those with a pose
-    poses: list[Transform]  # origin_from_rig
+    images: list[int]  # places of those with a pose
+    poses: list[Transform]  # origin_from_camera
     apart: list[list[int]]  # markers that do not hang together with these, part by part
 
 
 class _MarkerSight(NamedTuple):
-    """A marker in an image of one of the cameras."""
+    """A marker in an image."""
 
     marker: int
-    camera: int
     rays: Array  # (4,2)
-    poses: list[tuple[Transform, float]]  # rig_from_marker, and how far it fits, of 1
+    poses: list[tuple[Transform, float]]  # camera_from_marker, and how far it fits, of 1
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _FrameView:
-    """One frame: the markers of the images of all cameras that were taken at about one time."""
-
-    time: float  # s
-    sights: list[_MarkerSight]
-
-
-def chain(
-    filmed: Sequence[Filmed], frames: Sequence[RigImages], markers: Sequence[Marker],
-    origin: int | None,
-) -> Chained:  # fmt: skip
+def chain(filmed: Filmed, markers: Sequence[Marker], origin: int | None) -> Chained:
     """Place the markers that hang together with one of them.
 
     Args:
-        filmed: by each camera.
-        frames: the images that belong together, in the order of their times.
+        filmed: the images.
         markers: all there may be; only their sizes count.
         origin: place of the one whose frame is that of the others; None: the first of the most
             that hang together.
     """
-    mounts = [Transform(m.axes, -m.axes @ m.centre) for m in (one.extrinsics for one in filmed)]
-    views = [_view(filmed, mounts, frame, markers) for frame in frames]
-    grown = {k: by for k, by in _growth(views).items() if abs(by) > _WRONG_SIZE}
-    if grown:
-        markers = [
-            replace(marker, corners=math.exp(grown.get(k, 0.0)) * marker.corners)
-            for k, marker in enumerate(markers)
-        ]
-        views = [_view(filmed, mounts, frame, markers) for frame in frames]
-    seen = sorted({sight.marker for view in views for sight in view.sights})
-    between, scores = _between(views, markers)
-    parts = _parts(seen, scores)
+    views = [_sights(filmed.camera, image, markers) for image in filmed.spotted]
+    seen = sorted({sight.marker for view in views for sight in view})
+    between = _between(views, markers)
+    place = {marker: k for k, marker in enumerate(seen)}
+    # SciPy 1.11 has no trees of other indices.
+    pairs = np.array([[place[a], place[b]] for a, b in between], np.int32).reshape(-1, 2)
+    costs = np.array([1.0 / support for _, support in between.values()])
+    graph = csr_array((costs, (pairs[:, 0], pairs[:, 1])), shape=(len(seen),) * 2)
+    tree = minimum_spanning_tree(graph)  # along the best supported chains
+    count, labels = connected_components(tree, directed=False)
+    parts = [[seen[m] for m in np.flatnonzero(labels == k).tolist()] for k in range(count)]
+    parts.sort(key=lambda part: (-len(part), part[0]))
     first = parts[0][0] if origin is None else origin
-    own = next(part for part in parts if first in part)
-    placed = _placed(first, own, between, scores)
-    own_frames, poses = _frame_poses(views, mounts, placed, markers)
-    apart = [part for part in parts if part is not own]
-    return Chained(markers, placed, own_frames, poses, apart)
+    order, before = breadth_first_order(tree, place[first], directed=False)
+    placed = {first: Transform(np.eye(3), np.zeros(3))}
+    for k in order[1:].tolist():
+        here, there = seen[k], seen[int(before[k])]
+        step = between[min(here, there), max(here, there)][0]
+        placed[here] = placed[there] @ (step if there < here else step.inverse())
+    images, poses = _image_poses(views, filmed.times(), placed, markers)
+    return Chained(placed, images, poses, [part for part in parts if first not in part])
 
 
-# Fewest images that compare the sizes of a pair of markers, and how well they must agree.
-_LEAST_SEEN, _AGREE = 6, 0.9
-_SIZE_ROUNDS = 10
-# Sizes that are wrong by more than this share: a first guess needs others.
-_WRONG_SIZE = 0.1
-
-
-def _growth(views: Sequence[_FrameView]) -> dict[int, float]:
-    """Return log sizes of markers over the given ones, beside most others.
-
-    The camera's way about a marker of the wrong size is too long or too short by that: two markers
-    of one image are at the same place beside each other whatever the way, which tells the ratio of
-    both. Least absolute deviations over all pairs, and of sizes from those that are said: along a
-    chain of pairs, ratios alone drift.
-    """
-    ways: dict[tuple[int, int], list[tuple[Array, Array]]] = {}
-    for view in views:
-        for one, other in combinations(sorted(view.sights, key=lambda of: of.marker), 2):
-            if one.camera != other.camera or one.marker == other.marker:
-                continue
-            first, second = (max(of.poses, key=lambda pose: pose[1])[0] for of in (one, other))
-            turn = first.rotation.T
-            way = turn @ first.translation, turn @ second.translation
-            ways.setdefault((one.marker, other.marker), []).append(way)
-    rows = []
-    for (a, b), every in ways.items():
-        x, y = (np.array(of) - np.mean(of, axis=0) for of in zip(*every, strict=True))
-        lengths = np.linalg.norm(x), np.linalg.norm(y)
-        if len(every) >= _LEAST_SEEN and np.sum(x * y) > _AGREE * lengths[0] * lengths[1]:
-            rows.append((a, b, np.log(lengths[0] / lengths[1])))
-    numbers = sorted({marker for row in rows for marker in row[:2]})
-    if not numbers:
-        return {}
-    said = np.eye(len(numbers))
-    design = np.concatenate([np.zeros((len(rows), len(numbers))), said])
-    ratios = np.array([row[2] for row in rows] + [0.0] * len(numbers))
-    for k, (a, b, _) in enumerate(rows):
-        design[k, numbers.index(a)], design[k, numbers.index(b)] = -1.0, 1.0
-    found, weights = np.zeros(len(numbers)), np.ones(len(ratios))
-    for _ in range(_SIZE_ROUNDS):
-        root = np.sqrt(weights)
-        found = np.linalg.lstsq(design * root[:, None], ratios * root, rcond=None)[0]
-        weights = 1.0 / np.maximum(np.abs(design @ found - ratios), 1e-2)
-    return dict(zip(numbers, (found - np.median(found)).tolist(), strict=True))
-
-
-def _view(
-    filmed: Sequence[Filmed], mounts: list[Transform], frame: RigImages, markers: Sequence[Marker]
-) -> _FrameView:
+def _sights(camera: Camera, image: Spotted, markers: Sequence[Marker]) -> list[_MarkerSight]:
     sights = []
-    for place, image in frame.images:
-        camera, spotted = filmed[place].camera, filmed[place].spotted[image]
-        back = mounts[place].inverse()
-        for marker, quad in zip(spotted.markers.tolist(), spotted.quads, strict=True):
-            own = camera.rays(quad)
-            found = _square_poses(markers[marker].corners, own, _SHUTTER / camera.focal_length)
-            if np.isfinite(own).all() and found:
-                found = [(back @ pose, fit) for pose, fit in found]
-                sights.append(_MarkerSight(marker, place, own, found))
-    return _FrameView(frame.time, sights)
+    for marker, quad in zip(image.markers.tolist(), image.quads, strict=True):
+        rays = camera.rays(quad)
+        if np.isfinite(rays).all():
+            poses = _square_poses(markers[marker].corners, rays, _SHUTTER / camera.focal_length)
+            if poses:
+                sights.append(_MarkerSight(marker, rays, poses))
+    return sights
 
 
 def _square_poses(corners: Array, rays: Array, doubt: float) -> list[tuple[Transform, float]]:
     """Return poses camera_from_marker that fit rays (4,2), and their weights, of 1."""
     try:
-        count, turns, places, errors = cv2.solvePnPGeneric(
+        _, turns, places, errors = cv2.solvePnPGeneric(
             corners, np.ascontiguousarray(rays), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
         )
     except cv2.error:
         return []
     fits = np.exp(-(np.ravel(errors) - np.min(errors)) / doubt)
-    found = [
-        (
-            Transform(
-                np.asarray(cv2.Rodrigues(turns[k])[0], np.float64),
-                np.asarray(places[k], np.float64).ravel(),
-            ),
-            fits[k],
-        )
-        for k in range(count)
+    return [
+        (Transform(Rotation.from_rotvec(turn.ravel()).as_matrix(), place.ravel()), fit)
+        for turn, place, fit in zip(turns, places, fits.tolist(), strict=True)
+        if place[2] > 0.0
     ]
-    return [(pose, float(fit)) for pose, fit in found if pose.translation[2] > 0.0]
 
 
 def _between(
-    views: list[_FrameView], markers: Sequence[Marker]
-) -> tuple[dict[tuple[int, int], Transform], dict[tuple[int, int], float]]:
+    views: list[list[_MarkerSight]], markers: Sequence[Marker]
+) -> dict[tuple[int, int], tuple[Transform, float]]:
     """Return transforms a_from_b of each pair a < b, and the number of images that support them."""
     images: dict[tuple[int, int], list[tuple[_MarkerSight, _MarkerSight]]] = {}
-    apart: dict[
-        tuple[int, int], list[tuple[_MarkerSight, _MarkerSight]]
-    ] = {}  # in images of two cameras
     for view in views:
-        by_marker = sorted(view.sights, key=lambda sight: sight.marker)
-        for one, other in combinations(by_marker, 2):
+        for one, other in combinations(sorted(view, key=lambda sight: sight.marker), 2):
             if one.marker != other.marker:
-                pairs = images if one.camera == other.camera else apart
-                pairs.setdefault((one.marker, other.marker), []).append((one, other))
-    between, scores = {}, {}
-    for (a, b), among in (apart | images).items():
-        step = -(-len(among) // _MOST_IMAGES)
+                images.setdefault((one.marker, other.marker), []).append((one, other))
+    between = {}
+    for (a, b), among in images.items():
         said = [
             (k, first.inverse() @ second, fit * other)
-            for k, (one, two) in enumerate(among[::step])
+            for k, (one, two) in enumerate(among[:: -(-len(among) // _MOST_IMAGES)])
             for first, fit in one.poses
             for second, other in two.poses
         ]
-        size = max(markers[a].size, markers[b].size)
-        between[a, b], scores[a, b] = _agreed(said, size)
-        if (a, b) not in images:
-            # The rig moves between images of two cameras: what one image says goes before.
-            scores[a, b] /= len(views)
-    return between, scores
+        between[a, b] = _agreed(said, max(markers[a].size, markers[b].size))
+    return between
 
 
 def _agreed(said: list[tuple[int, Transform, float]], size: float) -> tuple[Transform, float]:
@@ -309,86 +230,40 @@ def _agreed(said: list[tuple[int, Transform, float]], size: float) -> tuple[Tran
     support = per_image.sum(axis=1)
     best = int(np.argmax(support))
     # The mean of what agrees with it, of each image one.
-    weights = np.where(
-        agree[best] == per_image[best][np.searchsorted(image[firsts], image)], agree[best], 0.0
-    )
-    u, _, vt = np.linalg.svd(np.einsum("n,nij->ij", weights, turns))
-    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    weights = agree[best] * (agree[best] == per_image[best][np.searchsorted(image[firsts], image)])
+    turn = Rotation.from_matrix(turns).mean(weights).as_matrix()
     return Transform(turn, weights @ places / weights.sum()), float(support[best])
 
 
-def _parts(markers: list[int], scores: dict[tuple[int, int], float]) -> list[list[int]]:
-    """Return connected markers, the largest part first."""
-    place = {marker: k for k, marker in enumerate(markers)}
-    pairs = np.array([[place[a], place[b]] for a, b in scores], np.int32).reshape(-1, 2)
-    graph = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(markers),) * 2)
-    count, labels = connected_components(graph, directed=False)
-    parts = [[m for m, of in zip(markers, labels, strict=True) if of == k] for k in range(count)]
-    return sorted(parts, key=lambda part: (-len(part), part[0]))
-
-
-def _placed(
-    origin: int, own: list[int], between: dict[tuple[int, int], Transform],
-    scores: dict[tuple[int, int], float],
-) -> dict[int, Transform]:  # fmt: skip
-    """Return origin_from_marker along the best supported chains."""
-    place = {marker: k for k, marker in enumerate(own)}
-    inside = [(pair, score) for pair, score in scores.items() if pair[0] in place]
-    # SciPy 1.11 has no trees of other indices.
-    pairs = np.array([[place[a], place[b]] for (a, b), _ in inside], np.int32).reshape(-1, 2)
-    costs = 1.0 / np.array([score for _, score in inside])
-    tree = minimum_spanning_tree(
-        csr_array((costs, (pairs[:, 0], pairs[:, 1])), shape=(len(own),) * 2)
-    )
-    order, before = breadth_first_order(tree, place[origin], directed=False)
-    placed = {origin: Transform(np.eye(3), np.zeros(3))}
-    for k in order[1:].tolist():
-        here, there = own[k], own[int(before[k])]
-        pair = (min(here, there), max(here, there))
-        step = between[pair] if there < here else between[pair].inverse()
-        placed[here] = placed[there] @ step
-    return placed
-
-
-def _frame_poses(
-    views: list[_FrameView], mounts: list[Transform], placed: dict[int, Transform],
+def _image_poses(
+    views: list[list[_MarkerSight]], times: Array, placed: dict[int, Transform],
     markers: Sequence[Marker],
 ) -> tuple[list[int], list[Transform]]:  # fmt: skip
-    """Return frames with a pose, and origin_from_rig of each."""
-    frames: list[int] = []
+    """Return images with a pose, and origin_from_camera of each."""
+    images: list[int] = []
     poses: list[Transform] = []
     for k, view in enumerate(views):
-        own = [sight for sight in view.sights if sight.marker in placed]
+        own = [sight for sight in view if sight.marker in placed]
         if not own:
             continue
-        by_camera = [
-            (
-                mounts[place],
-                np.concatenate([_corners(markers[of.marker], placed[of.marker]) for of in seen]),
-                np.concatenate([of.rays for of in seen]),
-            )
-            for place in sorted({sight.camera for sight in own})
-            for seen in [[sight for sight in own if sight.camera == place]]
-        ]
-        options = [pose @ placed[of.marker].inverse() for of in own for pose, _ in of.poses]
-        costs = np.array([
-            sum(_cost(mount @ option, points, rays) for mount, points, rays in by_camera)
-            for option in options
+        points = np.concatenate([
+            markers[of.marker].corners @ placed[of.marker].rotation.T
+            + placed[of.marker].translation
+            for of in own
         ])  # fmt: skip
-        alike = [option for option, cost in zip(options, costs, strict=True)
-                 if cost <= _ALIKE * costs.min()]  # fmt: skip
+        rays = np.concatenate([of.rays for of in own])
+        options = [pose @ placed[of.marker].inverse() for of in own for pose, _ in of.poses]
+        costs = np.array([_cost(option, points, rays) for option in options])
         best = options[int(np.argmin(costs))]
-        near = frames and view.time - views[frames[-1]].time < _NEAR
-        if near and len(alike) > 1:
+        if images and times[k] - times[images[-1]] < _NEAR:
+            alike = np.flatnonzero(costs <= _ALIKE * costs.min()).tolist()
             before = poses[-1].rotation
-            best = max(alike, key=lambda option: float(np.sum(option.rotation.T * before)))
-        frames.append(k)
+            best = max(
+                (options[m] for m in alike), key=lambda of: float(np.sum(of.rotation.T * before))
+            )
+        images.append(k)
         poses.append(best.inverse())
-    return frames, poses
-
-
-def _corners(marker: Marker, placed: Transform) -> Array:
-    return np.asarray(marker.corners @ placed.rotation.T + placed.translation)
+    return images, poses
 
 
 def _cost(pose: Transform, points: Array, rays: Array) -> float:

@@ -20,7 +20,7 @@ from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.system import Factored
 from rs_localizer.tools.adjust.variables import Freedom, Unknowns
 from rs_localizer.tools.mapping.gauge import through
-from rs_localizer.tools.mapping.map_keypoints import MapFreedom, MapObservations, RigCamera
+from rs_localizer.tools.mapping.map_keypoints import MapFreedom, MapObservations
 from rs_localizer.tools.mapping.refinement import (
     DRIFT,
     RefinedMap,
@@ -40,7 +40,7 @@ def errors(found: RefinedMap, truth: Walk) -> np.ndarray:
 def small_problem() -> tuple[Problem, Unknowns]:
     rng = np.random.default_rng(0)
     scene = walk(rng, np.array([0.0, 0.03, 0.06, 1.0, 2.0]), points=120, count=25)
-    whole = Refinement([RigCamera(camera())], scene.seen, scene.start, MapFreedom())
+    whole = Refinement(camera(), 0.0, scene.seen, scene.start, MapFreedom())
     return whole.problem(Freedom(lens=True, angular_velocity=2.0, linear_velocity=1.0)), whole.state
 
 
