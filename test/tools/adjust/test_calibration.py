@@ -11,7 +11,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.tools import first_lens as first_lens_module
 from rs_localizer.tools import verdict
 from rs_localizer.tools.adjust.observe import ImagePoints
 from rs_localizer.tools.camera_calibration import CameraCalibration, calibrate
@@ -106,16 +105,10 @@ def test_a_picture_that_is_turned_after_the_fact_makes_parts_disagree():
     assert not any("times less likely" in remark for remark in verdict.remarks(found))
 
 
-@pytest.mark.parametrize(
-    ("model", "deep"), [("equidistant", False), ("equidistant", True), ("plumb_bob", False)]
-)
-def test_the_distortion_model_is_that_of_the_lens(model, deep):
-    """A fisheye of 150 degrees that shows a board, or a heap, in every direction; and an ordinary
-    lens.
-    """
+@pytest.mark.parametrize("model", ["equidistant", "plumb_bob"])
+def test_the_distortion_model_is_that_of_the_lens(model):
+    """A fisheye of 150 degrees that shows a board in every direction; and an ordinary lens."""
     rng, flat = np.random.default_rng(2), projector.board(8, 6, 0.05, 0.0)
-    if deep:  # OpenCV's calibration of fisheyes takes boards only, and no lens was found
-        flat = flat + rng.uniform(-0.1, 0.1, flat.shape)
     camera = CAMERA
     if model == "equidistant":
         K, D = np.diag([240.0, 241.0, 1.0]), np.array([0.02, -0.01, 0.003, 0.0])
@@ -133,51 +126,3 @@ def test_the_distortion_model_is_that_of_the_lens(model, deep):
     assert found.distortion_model == model
     corner = np.array([[0.8, 0.6]]) if model == "equidistant" else np.array([[0.5, 0.4]])
     np.testing.assert_allclose(found.distort(corner)[0], camera.distort(corner)[0], atol=1.0)
-
-
-def test_an_image_before_two_walls_has_a_pose():
-    """Of these 300 ``cv2.solvePnP`` alone finds six behind the camera."""
-    rng, middle = np.random.default_rng(0), np.array([319.5, 239.5])
-    camera = Camera(640, 480, [[500.0, 0.0, middle[0]], [0.0, 500.0, middle[1]], [0.0, 0.0, 1.0]])
-    x, z = (axis.ravel() for axis in np.mgrid[-1.2:1.3:0.2, -0.8:0.9:0.2])
-    walls = np.concatenate([np.c_[x, 0.0 * x, z], np.c_[0.0 * x + 1.3, x - 1.3, z]])
-    for _ in range(300):
-        eye = rng.uniform([-0.8, -2.2, -0.5], [0.8, -1.0, 0.5])
-        forward = walls[rng.integers(len(walls))] - eye
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        axes = np.array([right, np.cross(forward, right), forward])
-        axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-        turned = Rotation.from_rotvec(rng.normal(0.0, 0.3, 3)).as_matrix() @ axes
-        local = (walls - eye) @ turned.T
-        with np.errstate(divide="ignore"):
-            pixels = 500.0 * local[:, :2] / local[:, 2:] + middle
-        inside = (local[:, 2] > 0.2) & ((pixels > 0) & (pixels < [640, 480])).all(axis=1)
-        if inside.sum() < 20:
-            continue
-        pixels = pixels[inside]
-        pixels += np.outer((pixels[:, 1] - 240.0) / 480.0, rng.normal(0.0, 12.0, 2))  # the shutter
-        pixels += rng.normal(0.0, 0.3, pixels.shape)
-        error = first_lens_module.reprojection_error(camera, ImagePoints(0, walls[inside], pixels))
-        assert error < 20.0
-
-
-def test_images_by_whose_first_pose_points_are_behind_the_camera_are_left_out(monkeypatch):
-    """Among those of a fisheye; the others find the lens."""
-    rng, board = np.random.default_rng(3), projector.board(8, 6, 0.05, 0.0)
-    lens = replace(CAMERA, D=np.array([0.02, -0.01, 0.003, 0.0]), distortion_model="equidistant")
-    images = []
-    for k in range(8):
-        turn = Rotation.from_rotvec(rng.normal(0.0, 0.4, 3))
-        pixels = lens.project(turn.apply(board - board.mean(axis=0)) + np.array([0.0, 0.0, 0.5]))
-        images.append(ImagePoints(10**9 + 10**8 * k, board - board.mean(axis=0), pixels))
-    pose = first_lens_module._pose
-    monkeypatch.setattr(
-        first_lens_module,
-        "_pose",
-        lambda camera, image: (
-            (np.eye(3), np.array([0.0, 0.0, -1.0])) if image is images[2] else pose(camera, image)
-        ),
-    )
-    error, found = first_lens_module._fisheye(lens.size, images, lens.K)
-    assert error < 1.0
-    np.testing.assert_allclose(found.K, lens.K, rtol=1e-3)
