@@ -100,7 +100,14 @@ setup(
         ],
         "colcon": ["colcon-common-extensions", "ros-jazzy-ament-package"],
         "docs": ["sphinx", "myst-parser", "sphinxcontrib-mermaid"],
-        "examples": ["h5py", "pyarrow", "pycolmap", "rerun-sdk"],
+        # Of telemetry-parser there is no wheel for 3.13, and a build needs Rust.
+        "examples": [
+            "h5py",
+            "pyarrow",
+            "pycolmap",
+            "rerun-sdk",
+            "telemetry-parser; python_version < '3.13'",
+        ],
         # calibrate, map survey, --smooth; pictures.
         "tools": ["scipy", "matplotlib", "Pillow>=9.1"],
         "evaluate": ["evo", "scipy", "matplotlib", "Pillow>=9.1"],
@@ -108,9 +115,8 @@ setup(
         "peers": ["poselib"],  # of the benchmarks
         "mapping": ["pycolmap", "scipy", "matplotlib"],
         "table": ["pyarrow"],
-        # Of telemetry-parser there is no wheel for 3.13, and a build needs Rust. PyAV decodes
-        # what OpenCV may not (AV1), and says where a video stops.
-        "video": ["av", "telemetry-parser; python_version < '3.13'"],
+        # PyAV decodes what OpenCV may not (AV1), and says where a video stops.
+        "video": ["av"],
         "test": [
             "build",
             # Runs kernels that are edited.

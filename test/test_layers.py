@@ -100,7 +100,6 @@ ONLY_IN = {
     ("matplotlib", "evo"): ("tools/",),
     ("pycolmap",): ("tools/", "io/maps/colmap_process.py"),
     ("av",): ("io/video.py", "io/video_packets.py"),
-    ("telemetry_parser",): ("io/telemetry_process.py",),
     ("dask", "distributed"): ("offline/fleet.py",),
     ("pyarrow",): ("offline/frame_table.py", "cli/replay_command.py"),
 }

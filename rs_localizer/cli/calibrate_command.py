@@ -20,7 +20,6 @@ from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.cli.rig_input import cameras_of, check_there, mounting_lines
 from rs_localizer.cli.settings_args import given_settings, given_topics, remapped
 from rs_localizer.cli.typed import typed
-from rs_localizer.io.image_clock import DEFAULT_START_NS
 from rs_localizer.io.topics import CAMERA_INFO, IMAGE, IMU
 
 if WORKING:
@@ -171,7 +170,6 @@ def _calibrated(
             own_stamps=source.own_stamps, done=bar.update,
         )  # fmt: skip
     print("\n".join(verdict.table(found, args.rate)))
-    image_input.print_telemetry(args, verdict.readout_time(found))
     if source.find_lens:
         print("\n".join(verdict.of_lens(found)))
     if source.imu is not None:
@@ -197,20 +195,13 @@ def _read(args: Options, config: NodeConfig) -> _Input:
 
 
 def _imu(args: Options, path: Path) -> ImuRecording:
-    """Return the readings of the IMU of a bag or a video."""
-    if is_bag(path):
-        with open_bag(path) as bag:
-            topics = remapped(args)
-            frame = optical_frame(bag, topics.get(CAMERA_INFO))
-            return read_imu_recording(bag, topics.get(IMU), frame)
-    telemetry = image_input.telemetry_of(path)
-    if args.remaps or telemetry is None or args.rate is not None:
-        raise UsageError(
-            "-r imu:=TOPIC is for bags, and --imu for videos with a gyroscope of their own clock "
-            "(without --rate): this one has none that is known"
-        )
-    stamps = DEFAULT_START_NS + np.round(1e9 * telemetry.times).astype(np.int64)
-    return ImuRecording(stamps, telemetry.rates, np.eye(3))
+    """Return the readings of the IMU of a bag."""
+    if not is_bag(path):
+        raise UsageError("--imu is for bags, which have an IMU beside the images")
+    with open_bag(path) as bag:
+        topics = remapped(args)
+        frame = optical_frame(bag, topics.get(CAMERA_INFO))
+        return read_imu_recording(bag, topics.get(IMU), frame)
 
 
 def _correspondences(args: Options, bag: BagReader, config: NodeConfig) -> _Input:

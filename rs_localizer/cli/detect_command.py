@@ -16,7 +16,6 @@ from rs_localizer.cli.image_input import (
     ImageOptions,
     opened,
     print_left_out,
-    print_telemetry,
     print_times,
     shutter_values,
 )
@@ -111,7 +110,6 @@ def detect(args: Options) -> Figures:
                 warnings += found.faults
         if values := {**of_map, **shutter_values(args)}:
             write_parameters(out / PARAMETERS, values)
-    print_telemetry(args)
     merged = {key: _WORST[key](each[key] for each in every) for key in every[0]}
     return {**merged, "warnings": "; ".join(warnings)}
 

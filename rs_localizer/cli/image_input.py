@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,12 +17,11 @@ from rs_localizer.io.camera_files import CALIBRATION_KINDS, read_calibration
 from rs_localizer.io.image_clock import ImageClock, readout_fault
 from rs_localizer.io.recording import PARAMETERS
 from rs_localizer.io.topics import CAMERA_INFO, IMAGE
-from rs_localizer.settings import build, camera_values
+from rs_localizer.settings import camera_values
 
 if WORKING:
     from rs_localizer.core.camera import Camera
     from rs_localizer.io.bags import is_bag, open_bag
-    from rs_localizer.io.telemetry import Telemetry, has_telemetry, read_telemetry
     from rs_localizer.io.video import has_times
     from rs_localizer.offline.image_sources import (
         INFO_TYPE,
@@ -36,11 +34,7 @@ if WORKING:
         from_video,
         image_files,
         name_times,
-        with_telemetry,
     )
-
-# Readout times that differ by less are called the same: what a file says counts rows its own way.
-_SAME = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,62 +69,10 @@ def shutter_values(args: ImageOptions) -> dict[str, Any]:
     if not given and is_bag(args.recording) and beside.exists():
         return given_values(replace(args, params=beside))
     values = given_values(args)
-    telemetry = telemetry_of(args.recording)
-    if telemetry is not None and telemetry.readout_time is not None:
-        values.setdefault("readout_time", telemetry.readout_time)
     if calibration is not None and not {"readout_time", "cameras"} & set(values):
         known = read_calibration(calibration).readout_time  # of Gyroflow's profiles
         values |= {"readout_time": known} if known else {}
     return values
-
-
-def telemetry_of(path: Path) -> Telemetry | None:
-    """Return the telemetry of a video; None without any, or if stabilization has spoilt it.
-
-    Raises:
-        ValueError: for telemetry that cannot be read.
-    """
-    telemetry = read_telemetry(path) if _has_telemetry(path) and _can_read() else None
-    return None if telemetry is None or telemetry.stabilizer else telemetry
-
-
-def _has_telemetry(path: Path) -> bool:
-    return path.is_file() and not is_bag(path) and has_telemetry(path)
-
-
-def _can_read() -> bool:
-    """Return True with the extra ``video``: PyAV has one clock for images and gyroscope."""
-    return all(importlib.util.find_spec(name) is not None for name in ("telemetry_parser", "av"))
-
-
-def print_telemetry(args: ImageOptions, used: float | None = None) -> None:
-    """Say what a video knows of its camera, and which of it is not used.
-
-    Args:
-        args: of the video.
-        used: the measured readout time, s; None: the one of the settings is used.
-    """
-    ours = build(shutter_values(args)).readout_time if used is None else used
-    if not _has_telemetry(args.recording):
-        return
-    if not _can_read():
-        print("note: the video has a gyroscope; to use it: pip install 'rs_localizer[video]'")
-    elif (telemetry := read_telemetry(args.recording)) is None:
-        return
-    elif telemetry.stabilizer:
-        print(
-            f"warning: {telemetry.camera} has stabilized this video ({telemetry.stabilizer}): its "
-            "rows are not what the shutter saw, and poses are wrong; switch it off. Its gyroscope "
-            "and readout time are not used"
-        )
-    else:
-        said = f"{telemetry.camera}: gyroscope at {telemetry.rate:.0f} Hz"
-        if known := telemetry.readout_time:
-            said += f", readout time {1e3 * known:.2f} ms"
-            if abs(ours / known - 1.0) > _SAME:
-                how = "given" if used is None else "measured"
-                said += f" (not used: {1e3 * ours:.2f} ms was {how})"
-        print(said)
 
 
 def print_left_out(refused: Mapping[str, str]) -> None:
@@ -188,7 +130,6 @@ def opened(args: ImageOptions, calibrated: bool = True) -> Iterator[Source]:
         return
     if args.remaps:
         raise UsageError("-r names topics of a bag")
-    telemetry = telemetry_of(path) if calibrated else None
     if camera is None and calibrated:
         raise UsageError("a video or folder has no camera_info: give --camera")
     clock, total = ImageClock(args.rate), None
@@ -203,5 +144,4 @@ def opened(args: ImageOptions, calibrated: bool = True) -> Iterator[Source]:
         )
     else:
         shots = from_video(path, camera, clock)
-    read = shots if telemetry is None else with_telemetry(shots, telemetry, clock)
-    yield Source(read, total, clock)
+    yield Source(shots, total, clock)

@@ -76,10 +76,6 @@ class ImageClock:
             raise TimesError("the images have no times of their own: give --rate")
         return None if own_ns is None else self._zero_ns + own_ns
 
-    def at(self, own_ns: int) -> int | None:
-        """Return the stamp of a time of a video's clock after its first image; None with a rate."""
-        return self._zero_ns + own_ns if self.rate is None and self._images else None
-
     @property
     def own_rate(self) -> float | None:
         """Mean images per second by the file's own times; None: it has none."""

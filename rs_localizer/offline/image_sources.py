@@ -4,7 +4,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -18,11 +18,8 @@ from rs_localizer.io.bags import BagReader, make_message
 from rs_localizer.io.image_clock import ImageClock
 from rs_localizer.io.image_files import FOREIGN, SUFFIXES, packed_image
 from rs_localizer.io.images import Image, read_any_image
-from rs_localizer.io.imu import make_reading
 from rs_localizer.io.messages import make_header, stamp_ns
 from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info
-from rs_localizer.io.telemetry import Telemetry
-from rs_localizer.io.topics import IMU
 from rs_localizer.io.video import Video, VideoImage
 from rs_localizer.io.video_packets import PACKET_TYPES, Packet, PacketDecoder
 from rs_localizer.offline.replay import CARRIED_TYPES, as_tf2
@@ -81,26 +78,6 @@ def from_video(path: Path, camera: Camera | None, clock: ImageClock) -> Iterator
             compressed = _compressed(now, frame, jpeg, "jpeg")
             yield Shot(Image(now, frame, gray), _info(camera, now, frame), compressed, now)
     clock.missing, clock.captured = video.fault, video.captured
-
-
-def with_telemetry(
-    shots: Iterable[Shot | Carried], telemetry: Telemetry, clock: ImageClock
-) -> Iterator[Shot | Carried]:
-    """Yield the images of a video, and its gyroscope as ``imu`` in camera axes and time."""
-    times_ns = np.round(1e9 * telemetry.times).astype(np.int64)
-    sent = 0
-    for shot in shots:
-        if clock.at(0) is not None:
-            until = int(np.searchsorted(times_ns + (clock.at(0) or 0), shot.recorded_ns, "right"))
-            for k in range(sent, until):
-                stamp = clock.at(int(times_ns[k]))
-                if stamp is not None and stamp > 0:
-                    reading = make_reading(
-                        stamp, telemetry.rates[k], telemetry.forces[k], CAMERA_FRAME
-                    )
-                    yield Carried(f"/{IMU}", stamp, reading)
-            sent = max(sent, until)
-        yield shot
 
 
 def from_files(files: list[Path], camera: Camera | None, clock: ImageClock) -> Iterator[Shot]:

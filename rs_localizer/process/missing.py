@@ -28,12 +28,10 @@ _EXTRAS = {
     "evo": "evaluate",
     "pyarrow": "table",
     "pycolmap": "mapping",
-    "telemetry_parser": "video",
 }
 _PIP = {
     "PIL": "Pillow",
     "cv2": "opencv-python-headless",
-    "telemetry_parser": "telemetry-parser",
     "yaml": "PyYAML",
 }
 

@@ -28,7 +28,7 @@ _REGIONS = (
 # A rotation that TF has otherwise by more than this (degrees), and more than chance, is doubted.
 _MOST_TURN, _SIGMAS = 1.0, 4.0
 # Source of the mount of the IMU on the camera.
-_GIVEN = "TF, or the axes of a video,"
+_GIVEN = "TF"
 # Corners that are bent by less (px) are those of a rectified film, or of a telephoto lens.
 _STRAIGHT = 1.5
 # A scale of the gyroscope that is worth a word.

@@ -2,9 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What tests of commands read: a flight, transforms, an IMU, ROS 1 bags, videos."""
 
-import struct
 from collections.abc import Iterable
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.cli.commands import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
-from rs_localizer.io.telemetry import CAMERA_FROM_SENSOR
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, simulate_frames
 from rs_localizer.tools.simulation.simulated_imu import ImuSettings, make_imu
@@ -65,51 +62,6 @@ def write_mp4(path: Path, images: Iterable[Any], rate: float) -> Path:
         writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
     writer.release()
     return path
-
-
-def field(tag: int, value: int | float | str | bytes) -> bytes:
-    """A field of a message of protobuf."""
-
-    def varint(number: int) -> bytes:
-        low = number & 0x7F
-        return bytes([low | 0x80]) + varint(number >> 7) if number > 0x7F else bytes([low])
-
-    if isinstance(value, int):
-        return varint(8 * tag) + varint(value)
-    if isinstance(value, float):
-        return varint(8 * tag + 1) + struct.pack("<d", value)
-    data = value.encode() if isinstance(value, str) else value
-    return varint(8 * tag + 2) + varint(len(data)) + data
-
-
-def insta360(readings: bytes, *about: bytes) -> bytes:
-    """What Insta360 appends to a video, as telemetry-parser's source describes it.
-
-    Args:
-        readings: rows of ms, three of the accelerometer, three of the gyroscope.
-        about: fields of the camera.
-    """
-    records = b""
-    for kind, style, data in ((3, 0, readings), (1, 1, b"".join(about))):
-        records += data + struct.pack("<BBI", style, kind, len(data))
-    end = bytes(32) + struct.pack("<II", len(records) + 72, 3)
-    return records + end + b"8db42d694ccc418790edff439fe026bf"
-
-
-# telemetry-parser turns the axes of a GO 3 by a quarter since 0.3.
-_NEW_AXES = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-
-
-def add_telemetry(path: Path, seconds: Any, rates: Any, readout: float) -> None:
-    """Append the gyroscope, rates (n,3) in the camera's axes at times (n,), to a video."""
-    new = metadata.version("telemetry-parser") >= "0.3"
-    sensor = np.asarray(rates) @ (_NEW_AXES if new else np.eye(3)) @ CAMERA_FROM_SENSOR
-    milliseconds = np.round(1e3 * np.asarray(seconds) + 1000).astype(int).tolist()
-    rows = zip(milliseconds, sensor.tolist(), strict=True)
-    readings = b"".join(struct.pack("<Q6d", t, 1.0, 0.0, 0.0, *rate) for t, rate in rows)
-    about = field(2, "Insta360 GO 3"), field(24, 1000), field(25, 1e3 * readout)
-    with path.open("ab") as file:
-        file.write(insta360(readings, *about))
 
 
 def write_ros1(path: Path, messages: Iterable[tuple[str, int, Any]]) -> Path:

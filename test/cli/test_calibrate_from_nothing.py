@@ -11,12 +11,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recorded import add_telemetry, write_mp4
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.commands import main
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.camera_files import read_calibration, write_calibration
+from rs_localizer.io.camera_files import read_calibration
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.settings import load_params_file
@@ -130,25 +129,3 @@ def test_a_film_gives_lens_readout_time_and_direction(film, tmp_path, capsys):
     (tmp_path / "one" / image.name).symlink_to(image)
     main(["calibrate", str(tmp_path / "one"), *smaller])
     assert f"a chessboard of {COLUMNS}x{ROWS} inner corners" in capsys.readouterr().err
-
-
-def test_a_video_with_a_gyroscope(film, tmp_path, capsys):
-    """Its gyroscope agrees with the images, its readout time does not."""
-    images = (cv2.imread(str(file), 0) for file in sorted(film.iterdir()))
-    path = write_mp4(tmp_path / "movie.mp4", images, RATE)
-    write_calibration(tmp_path / "lens.yaml", LENS)
-    times, late = np.arange(0.0, SECONDS, 0.005), 0.003
-    before, after = (Rotation.from_matrix(pose(times - late + d)[0]) for d in (-1e-4, 1e-4))
-    add_telemetry(path, times, (before.inv() * after).as_rotvec() / 2e-4, 0.016)
-    words = ["calibrate", str(path), *BOARD]
-    out = tmp_path / "camera.yaml"
-    words += ["--calibration", str(tmp_path / "lens.yaml"), "--imu"]
-    assert main([*words, "--out", str(out)]) == 0
-    said = capsys.readouterr().out
-    values = load_params_file(out)
-    assert values["readout_time"] == pytest.approx(READOUT, abs=3e-4)
-    assert "readout time 16.00 ms (not used: " in said
-    assert values["imu.time_offset"] == pytest.approx(-late, abs=1e-3)
-    assert "TF, or the axes of a video, agrees with the rotation to 0." in said
-    assert main([*words, "--rate", "30"]) == 2
-    assert "this one has none that is known" in capsys.readouterr().err

@@ -1,15 +1,12 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Names of image files that are times, and what goes along with images."""
+"""Names of image files that are times."""
 
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
-import numpy as np
 import pytest
 
-from rs_localizer.offline.image_sources import Carried, name_times, with_telemetry
+from rs_localizer.offline.image_sources import name_times
 
 EVERY_33_MS = [0, 33_366_000, 66_733_000]
 
@@ -36,18 +33,3 @@ def test_their_unit_is_that_of_the_interval(first_ns, unit):
 @pytest.mark.parametrize("names", [("0001", "0002", "0003"), ("10", "15", "20"), ("a", "b")])
 def test_numbers_of_frames_are_none(names):
     assert name_times([Path(f"{name}.png") for name in names]) is None
-
-
-def test_readings_come_before_the_image_of_their_time_and_each_once():
-    start = 10**9
-    times = np.array([0.0, 0.005, 0.01, 0.02, 0.03])
-    telemetry: Any = SimpleNamespace(
-        times=times, rates=np.outer(times, np.ones(3)), forces=np.zeros((5, 3))
-    )
-    clock: Any = SimpleNamespace(at=lambda own_ns: start + own_ns)
-    shots: Any = [SimpleNamespace(recorded_ns=start + k * 10**7) for k in range(3)]
-    given = list(with_telemetry(shots, telemetry, clock))
-    order = [given.index(shot) for shot in shots]
-    assert order == [1, 4, 6]
-    stamps = [item.recorded_ns for item in given if isinstance(item, Carried)]
-    assert stamps == [start, start + 5_000_000, start + 10_000_000, start + 20_000_000]

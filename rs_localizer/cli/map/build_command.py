@@ -15,7 +15,6 @@ from rs_localizer.cli.image_input import (
     ImageOptions,
     opened,
     print_left_out,
-    print_telemetry,
     print_times,
     shutter_values,
 )
@@ -98,7 +97,6 @@ def run(args: Options) -> None:
     require()
     check_there([args.recording])
     markers = None if args.markers is None else read_checked_map(args.markers)
-    print_telemetry(args)
     shutter, frame = shutter_of(args), MAP_FRAME if markers is None else markers.map_frame
     with atomic_directory(args.out, earlier_result(args, MAP)) as out:
         out.mkdir()
