@@ -99,7 +99,7 @@ ONLY_IN = {
     ("scipy",): ("tools/", "cli/"),
     ("matplotlib", "evo"): ("tools/",),
     ("pycolmap",): ("tools/", "io/maps/colmap_process.py"),
-    ("av",): ("io/video.py", "io/video_packets.py"),
+    ("av",): ("io/video.py",),
     ("dask", "distributed"): ("offline/fleet.py",),
     ("pyarrow",): ("offline/frame_table.py", "cli/replay_command.py"),
 }

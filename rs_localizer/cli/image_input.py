@@ -24,10 +24,10 @@ if WORKING:
     from rs_localizer.io.bags import is_bag, open_bag
     from rs_localizer.io.video import has_times
     from rs_localizer.offline.image_sources import (
+        IMAGE_TYPES,
         INFO_TYPE,
         Carried,
         Shot,
-        find_images,
         find_topic,
         from_bag,
         from_files,
@@ -123,7 +123,7 @@ def opened(args: ImageOptions, calibrated: bool = True) -> Iterator[Source]:
             raise UsageError("--rate is for videos and folders; a bag has its own times")
         topics, info = remapped(args), None
         with open_bag(path) as bag:
-            topic = find_images(bag, topics.get(IMAGE))
+            topic = find_topic(bag, IMAGE_TYPES, topics.get(IMAGE), "-r image:=")
             if camera is None and (calibrated or INFO_TYPE in bag.topics.values()):
                 info = find_topic(bag, (INFO_TYPE,), topics.get(CAMERA_INFO), "-r camera_info:=")
             yield Source(from_bag(bag, topic, info, camera), bag.count([topic]), None)

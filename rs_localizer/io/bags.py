@@ -29,7 +29,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
-from rs_localizer.io import detections, video_packets
+from rs_localizer.io import detections
 from rs_localizer.io.containers import (
     METADATA,
     ZSTD,
@@ -53,10 +53,6 @@ _LATCHED = Qos(
 )  # fmt: skip
 
 
-# Types that ROS itself does not have.
-_DEFINITIONS = detections.DEFINITIONS | video_packets.DEFINITIONS
-
-
 class BagError(ValueError):
     """A recording that cannot be read or written; the message names the path and the fault."""
 
@@ -66,9 +62,9 @@ limit_rosbags()
 
 @lru_cache(maxsize=1)
 def typestore() -> Typestore:
-    """Return the message types of ROS 2 Jazzy, of detections and of videos in packets."""
+    """Return the message types of ROS 2 Jazzy, and of detections, which ROS does not have."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    for name, text in _DEFINITIONS.items():
+    for name, text in detections.DEFINITIONS.items():
         store.register(get_types_from_msg(text, name))
     return store
 
@@ -129,7 +125,7 @@ class BagReader:
     def _check_types(self, names: Collection[str]) -> None:
         """Refuse types that a recording describes otherwise than ROS: fields would be missed."""
         own, standard = self._reader.typestore.fielddefs, typestore().fielddefs
-        for name in (set(names) & set(standard)) - set(_DEFINITIONS):
+        for name in (set(names) & set(standard)) - set(detections.DEFINITIONS):
             if _fields_of(name, own) != _fields_of(name, standard):
                 raise BagError(f"{self.path} describes {name} otherwise than ROS 2 Jazzy does")
 

@@ -66,8 +66,7 @@ _FORMATS = (("JPEG", b"\xff\xd8", b"\xff\xd9"), ("PNG", b"\x89PNG\r\n\x1a\n", b"
 # Pixels per byte: of a dark scene, compressed much, and beside that of an image that is all alike.
 # One bit per pixel comes to 8000, and a JPEG to 500, which takes 3 bytes each to decode.
 _DENSEST, _ALIKE = 32, 4_000_000
-MOST_PIXELS = 150_000_000
-"""No camera has more pixels; a decoded pixel takes 8 bytes at most."""
+_MOST_PIXELS = 150_000_000  # of a camera; a decoded one takes 8 bytes at most
 # Chunks that a grey image depends on; PNG (third edition), section 5.6.
 _STILL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 # JPEG's markers of frames, by which the size is given.
@@ -91,7 +90,7 @@ class Image:
 
 def most_pixels(packed: int) -> int:
     """Return the most pixels that an image of this many packed bytes may have."""
-    return min(_ALIKE + _DENSEST * packed, MOST_PIXELS)
+    return min(_ALIKE + _DENSEST * packed, _MOST_PIXELS)
 
 
 def read_any_image(message: Any) -> Image:
@@ -172,7 +171,11 @@ def decode(packed: bytes, format_: str) -> Gray:
         raise MessageError(
             f"the {name} image of {len(data)} bytes cannot be decoded: no header has its size"
         )
-    check_size(size, len(data), f"the {name} image")
+    if math.prod(size) > most_pixels(len(data)):
+        raise MessageError(
+            f"the {name} image says that it is {size[0]} x {size[1]}, too much for {len(data)} "
+            f"bytes, or more than {_MOST_PIXELS // 1_000_000} megapixels"
+        )
     if name == "PNG":
         data = np.frombuffer(_still_png(packed), np.uint8)
     try:
@@ -182,15 +185,6 @@ def decode(packed: bytes, format_: str) -> Gray:
     if decoded is None:
         raise MessageError(f"the {name} image of {len(data)} bytes cannot be decoded")
     return _eight_bits(np.asarray(decoded))
-
-
-def check_size(size: tuple[int, int], count: int, what: str) -> None:
-    """Refuse an image (``what``) of more pixels than its bytes can hold, or any camera has."""
-    if math.prod(size) > most_pixels(count):
-        raise MessageError(
-            f"{what} says that it is {size[0]} x {size[1]}, too much for {count} bytes, or more "
-            f"than {MOST_PIXELS // 1_000_000} megapixels"
-        )
 
 
 def _claimed_size(data: bytes, name: str) -> tuple[int, int] | None:

@@ -3,10 +3,8 @@
 """Sources of images, offline: a video, a folder of files, a bag."""
 
 import re
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +14,16 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.io.bags import BagReader, make_message
 from rs_localizer.io.image_clock import ImageClock
-from rs_localizer.io.image_files import FOREIGN, SUFFIXES, packed_image
 from rs_localizer.io.images import Image, read_any_image
 from rs_localizer.io.messages import make_header, stamp_ns
 from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info
-from rs_localizer.io.video import Video, VideoImage
-from rs_localizer.io.video_packets import PACKET_TYPES, Packet, PacketDecoder
+from rs_localizer.io.video import Video
 from rs_localizer.offline.replay import CARRIED_TYPES, as_tf2
 from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+_FORMATS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png"}  # of image files
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".mjpeg", ".mjpg", ".m4v", ".h264", ".ts",
            ".insv")  # fmt: skip
 
@@ -87,19 +84,12 @@ def from_files(files: list[Path], camera: Camera | None, clock: ImageClock) -> I
         own = None if times is None else times[file]
         now = clock.relative(None) if own is None else clock.absolute(own)
         assert now is not None  # a clock without a rate has refused
-        image, compressed = _read_file(file, now)
+        packed = _FORMATS[file.suffix.lower()]
+        compressed = _compressed(now, CAMERA_FRAME, file.read_bytes(), packed)
+        image = read_or_refuse(read_any_image, compressed, Reason.BAD_IMAGE)
         if isinstance(image, Refusal):
             image = Refusal(image.reason, f"{file.name}: {image.detail}")
         yield Shot(image, _info(camera, now, CAMERA_FRAME), compressed, now)
-
-
-def _read_file(file: Path, stamp: int) -> tuple[Image | Refusal, Any]:
-    """Read the image of a file, and return it as sensor_msgs/CompressedImage, too; or None."""
-    packed = read_or_refuse(packed_image, file, Reason.BAD_IMAGE)
-    if isinstance(packed, Refusal):
-        return packed, None
-    compressed = _compressed(stamp, CAMERA_FRAME, *packed)
-    return read_or_refuse(read_any_image, compressed, Reason.BAD_IMAGE), compressed
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -109,15 +99,11 @@ def image_files(folder: Path) -> list[Path]:
         SourceError: when there is none.
     """
     every = [file for file in folder.iterdir() if file.is_file()]  # /dev/zero has no end
-    files = [file for file in every if file.suffix.lower() in SUFFIXES]
+    files = [file for file in every if file.suffix.lower() in _FORMATS]
     if not files:
-        foreign = Counter(file.suffix.lower() for file in every if file.suffix.lower() in FOREIGN)
-        if not foreign:
-            raise SourceError(f"{folder} has no images: no file ends in {', '.join(SUFFIXES)}")
-        (suffix, count), *_ = foreign.most_common(1)
         raise SourceError(
-            f"{folder} has {count} images that cannot be read ({suffix}): convert them to PNG or "
-            f"JPEG, without turning or scaling them, by {FOREIGN[suffix]} for example"
+            f"{folder} has no images: no file ends in {', '.join(_FORMATS)}; convert others to PNG "
+            "without turning or scaling them"
         )
     if (times := name_times(files)) is not None:
         return sorted(files, key=times.__getitem__)
@@ -129,36 +115,16 @@ def image_files(folder: Path) -> list[Path]:
 def holds_images(path: Path) -> str:
     """Describe the images of a path that is no recording, as ``is a video``; empty: none."""
     if path.is_dir():
-        count = sum(file.suffix.lower() in (*SUFFIXES, *FOREIGN) for file in path.iterdir())
+        count = sum(file.suffix.lower() in _FORMATS for file in path.iterdir())
         return f"is a folder of {count} images" if count else ""
-    if path.suffix.lower() in SUFFIXES:
+    if path.suffix.lower() in _FORMATS:
         return "is an image"
     return "is a video" if path.is_file() and path.suffix.lower() in _VIDEOS else ""
 
 
 def image_topics(bag: BagReader) -> list[str]:
-    """Return the topics of a bag with images, or with packets of a video."""
-    kinds = (*IMAGE_TYPES, *PACKET_TYPES)
-    return sorted(topic for topic, kind in bag.topics.items() if kind in kinds)
-
-
-def find_images(bag: BagReader, given: str | None) -> str:
-    """Return the topic of images, given or the only one, else of a video in packets.
-
-    Raises:
-        SourceError: when it is not there, several could be meant, or PyAV is missing.
-    """
-    kinds = set(bag.topics.values())
-    packed = bag.topics.get(given) in PACKET_TYPES if given else not kinds & set(IMAGE_TYPES)
-    if not packed or not kinds & set(PACKET_TYPES):
-        return find_topic(bag, IMAGE_TYPES, given, "-r image:=")
-    topic = find_topic(bag, PACKET_TYPES, given, "-r image:=")
-    if find_spec("av") is None:
-        raise SourceError(
-            f"the images of {topic} are packets of a video ({bag.topics[topic]}), which PyAV "
-            "decodes: pip install av (the extra video of rs_localizer)"
-        )
-    return topic
+    """Return the topics of a bag with images."""
+    return sorted(topic for topic, kind in bag.topics.items() if kind in IMAGE_TYPES)
 
 
 def _since_1970(file: Path) -> int | None:
@@ -216,7 +182,6 @@ def from_bag(
     Between them comes what replay needs besides: transforms and inertial measurements.
     """
     carried = [topic for topic, kind in bag.topics.items() if kind in CARRIED_TYPES]
-    decoder = PacketDecoder() if bag.topics[image_topic] in PACKET_TYPES else None
     topics = [image_topic, *carried]
     latest: Any = None
     if info_topic is not None:
@@ -229,9 +194,6 @@ def from_bag(
             latest = message
         elif topic in carried:
             yield Carried(topic, recorded_ns, as_tf2(message))
-        elif decoder is not None:
-            for decoded in decoder.decode(message, (latest, recorded_ns)):
-                yield _of_packet(*decoded, camera)
         else:
             image = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)
             compressed = message if hasattr(message, "format") else None
@@ -240,20 +202,6 @@ def from_bag(
                 frame = str(message.header.frame_id) or CAMERA_FRAME
                 info = make_camera_info(camera, stamp_ns(message), frame)
             yield Shot(image, info, compressed, recorded_ns)
-    if decoder is not None:
-        for decoded in decoder.rest():
-            yield _of_packet(*decoded, camera)
-
-
-def _of_packet(packet: Packet, found: VideoImage | str, camera: Camera | None) -> Shot:
-    """Return the image of a packet that came beside camera_info, or its loss."""
-    info, recorded_ns = packet.beside
-    if camera is not None:
-        info = make_camera_info(camera, packet.stamp_ns, packet.frame or CAMERA_FRAME)
-    if isinstance(found, str):
-        return Shot(Refusal(Reason.BAD_IMAGE, found), info, None, recorded_ns)
-    compressed = _compressed(packet.stamp_ns, packet.frame, found.jpeg, "jpeg")
-    return Shot(Image(packet.stamp_ns, packet.frame, found.image), info, compressed, recorded_ns)
 
 
 def _compressed(stamp: int, frame: str, data: bytes, format_: str) -> Any:

@@ -4,7 +4,6 @@
 
 # Ubuntu's package for each imported name, and pip's where Ubuntu 24.04 has none.
 _UBUNTU = {
-    "PIL": "python3-pil",
     "cv2": "python3-opencv",
     "matplotlib": "python3-matplotlib",
     "numpy": "python3-numpy",
@@ -30,7 +29,6 @@ _EXTRAS = {
     "pycolmap": "mapping",
 }
 _PIP = {
-    "PIL": "Pillow",
     "cv2": "opencv-python-headless",
     "yaml": "PyYAML",
 }
