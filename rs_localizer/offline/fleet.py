@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import fcntl
 import io
 import json
 import logging
@@ -17,17 +16,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.io.atomic_files import (
-    atomic_directory,
-    atomic_files,
-    content,
-    remove_unfinished,
-    write_errors,
-)
+from rs_localizer.io.atomic_files import atomic_directory, atomic_files, content, write_errors
 from rs_localizer.process import ignore_working_folder
 
 Figures = dict[str, float | int | str]
 """Figures of a recording, by identifiers with their units."""
+
+Outcome = Figures | str
+"""Figures of a task that is done; of one that failed, why, in one line."""
 
 MARKER, LOG = "fleet.json", "log.txt"
 """In each complete result: what it is of, written last; and what the command would have said."""
@@ -55,10 +51,6 @@ class Task:
     recording: Path  # absolute, as the folder: workers are elsewhere
     folder: Path
     settings: str  # version and options, as text
-
-
-Outcome = Figures | str
-"""Figures of a task that is done; of one that failed, why, in one line."""
 
 
 def tasks_of(
@@ -99,28 +91,23 @@ def perform(task: Task) -> Outcome:
     Whatever goes wrong with the recording is an outcome, not an exception.
     """
     ignore_working_folder()  # of a worker of Dask, which another program has started
-    here, (said, inner) = socket.gethostname(), (io.StringIO(), task.folder)
+    here, said = socket.gethostname(), io.StringIO()
     if not task.settings.startswith(f"{version(_PACKAGE)} "):
         return f"the worker on {here} has another rs_localizer: install the same"
     if not task.folder.parent.is_dir():
         return f"the worker on {here} does not see {task.folder.parent}"
-    if (figures := finished(task)) is not None:
-        return figures
+    if (known := finished(task)) is not None:
+        return known
+    inner = task.folder
     try:
         # The existing result has other settings.
         with atomic_directory(task.folder, content(task.folder)) as inner:
             with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-                try:
-                    figures = task.work(task.recording, inner)
-                except OSError as error:  # what cannot be read; the folder can be written
-                    raise ValueError(str(error)) from error
+                figures = task.work(task.recording, inner)
             (inner / LOG).write_text(said.getvalue().replace(str(inner), task.folder.name))
             about = {"recording": task.recording, "settings": task.settings, "figures": figures}
             (inner / MARKER).write_text(json.dumps(about, indent=1, default=str))
     except Exception as error:
-        # Another worker, taken for lost, may have been at it, too.
-        if (known := finished(task)) is not None:
-            return known
         text = " ".join(str(error).split()) or type(error).__name__
         kind = "" if isinstance(error, (ValueError, OSError)) else f"{type(error).__name__}: "
         return (kind + text).replace(str(inner), str(task.folder))
@@ -152,11 +139,9 @@ def perform_all(
         place: Any = scheduler
         if scheduler is None:
             stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": 0}))
-            of_each: dict[str, Any] = {
-                "threads_per_worker": 1, "dashboard_address": None,
-                "preload": _PRELOAD,
-            }  # fmt: skip
-            place = stack.enter_context(LocalCluster(n_workers=workers, **of_each))
+            place = stack.enter_context(LocalCluster(
+                n_workers=workers, threads_per_worker=1, dashboard_address=None, preload=_PRELOAD
+            ))  # fmt: skip
         try:
             client = stack.enter_context(Client(place, timeout=_CONNECT_TIMEOUT))
         except (OSError, ValueError) as error:
@@ -164,16 +149,13 @@ def perform_all(
             raise ValueError(f"no Dask scheduler answers at {scheduler}: {reason}") from error
         # Not by what they are: a result that has been removed would be taken as done.
         futures = dict(zip(client.map(perform, tasks, pure=False), tasks, strict=True))
-        again = dict[Any, Task]()  # Dask blames all that waited at a worker for its end
-        for future, task in ((each, futures[each]) for each in as_completed(futures)):
+        again = list[Task]()  # Dask blames all that waited at a worker for its end
+        for future in as_completed(futures):
             if isinstance(future.exception(), KilledWorker):
-                again[task.folder] = task
+                again.append(futures[future])
             else:
-                yield task, _outcome(future)
-        for task in again.values():
-            future = client.submit(perform, task, pure=False)
-            future.exception()
-            yield task, _outcome(future)
+                yield futures[future], _outcome(future)
+        yield from ((task, _outcome(client.submit(perform, task, pure=False))) for task in again)
 
 
 def _outcome(future: Any) -> Outcome:
@@ -202,27 +184,21 @@ def do_all(
         heard: called as tasks end that had not been done before.
 
     Raises:
-        ValueError: while another command is at it; as :func:`perform_all`.
+        ValueError: as :func:`perform_all`.
     """
     with write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
-    with (out / ".lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise ValueError(f"another command is writing to {out}; wait until it ends") from None
-        outcomes = dict[Path, Outcome]()
-        waiting = [task for task in tasks if finished(task) is None]
-        try:
-            with contextlib.closing(perform_all(waiting, scheduler, workers)) as performed:
-                for task, outcome in performed:
-                    outcomes[task.folder] = outcome
-                    heard(task, outcome)
-        finally:
-            remove_unfinished(out)  # what workers that were killed have left
-            for task in tasks:  # done before, or not heard of, as after Ctrl-C
-                outcomes.setdefault(task.folder, finished(task) or "not done")
-            _summarize({task: outcomes[task.folder] for task in tasks}, out / SUMMARY)
+    outcomes = dict[Path, Outcome]()
+    waiting = [task for task in tasks if finished(task) is None]
+    try:
+        with contextlib.closing(perform_all(waiting, scheduler, workers)) as performed:
+            for task, outcome in performed:
+                outcomes[task.folder] = outcome
+                heard(task, outcome)
+    finally:
+        for task in tasks:  # done before, or not heard of, as after Ctrl-C
+            outcomes.setdefault(task.folder, finished(task) or "not done")
+        _summarize({task: outcomes[task.folder] for task in tasks}, out / SUMMARY)
     return outcomes
 
 

@@ -31,10 +31,7 @@ sys.addaudithook(_hear)  # for good: Python removes none
 
 @pytest.fixture(autouse=True)
 def whole_results_only(monkeypatch, tmp_path_factory) -> Iterator[None]:
-    """Within a command, files are opened for writing in a workplace of atomic_files alone.
-
-    But for the lock of a fleet.
-    """
+    """Within a command, files are opened for writing in a workplace of atomic_files alone."""
     output = commands._output
 
     @contextlib.contextmanager
@@ -49,4 +46,4 @@ def whole_results_only(monkeypatch, tmp_path_factory) -> Iterator[None]:
     monkeypatch.setattr(commands, "_output", watched)
     _seen.clear()
     yield
-    assert [path for path in _seen if ".unfinished-" not in path and "/.lock" not in path] == []
+    assert [path for path in _seen if ".unfinished-" not in path] == []

@@ -4,7 +4,6 @@
 
 import csv
 import dataclasses
-import fcntl
 import filecmp
 import importlib
 import os
@@ -91,10 +90,6 @@ def test_results_of_other_settings_are_in_the_way(recordings, tmp_path, monkeypa
     assert main([*words, "--overwrite"]) == 1
     assert (out / "a_flight" / "mine").exists()  # until there is a better one
     assert rows(out)["b_flight"]["reason"] == "not done"
-    with (out / ".lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        assert main([*words, "--overwrite"]) == 1
-    assert f"another command is writing to {out}; wait" in capsys.readouterr().err
 
 
 def test_what_goes_wrong_is_one_line(recordings, tmp_path, monkeypatch, capsys):
@@ -159,7 +154,8 @@ def test_a_recording_that_kills_its_process_does_not_stop_the_others(tmp_path, m
     assert outcomes["good"] == outcomes["fine"] == {"frames": 1}
     assert outcomes["deadly"].startswith("lost: ")
     assert outcomes["another"].startswith("lost: ")
-    assert sorted(path.name for path in out.iterdir() if path.is_dir()) == ["fine", "good"]
+    whole = {path.name for path in out.iterdir() if path.is_dir() and path.name[0] != "."}
+    assert whole == {"fine", "good"}
 
 
 def test_ctrl_c_leaves_whole_results_only_and_the_next_run_goes_on(
