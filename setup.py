@@ -115,7 +115,6 @@ setup(
         "peers": ["poselib"],  # of the benchmarks
         "mapping": ["pycolmap", "scipy", "matplotlib"],
         "table": ["pyarrow"],
-        # PyAV decodes what OpenCV may not (AV1), and says where a video stops.
         "video": ["av"],
         "test": [
             "build",

@@ -4,9 +4,7 @@
 
 import contextlib
 import itertools
-import os
 from collections.abc import Iterator, Mapping
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,9 +36,8 @@ class VideoImage(NamedTuple):
 class Video:
     """The images of a video, in the order of presentation; to be iterated over once.
 
-    They are read by PyAV, where it is installed, and compressed anew: it decodes what OpenCV may
-    have no decoder for (AV1), and says where it stops.
-    OpenCV counts from the first image on. A plain stream of JPEG images (``.mjpeg``) has no times.
+    They are read by PyAV (extra ``video``) and compressed anew. A plain stream of JPEG images
+    (``.mjpeg``) has no times.
 
     Args:
         path: of the video.
@@ -61,16 +58,12 @@ class Video:
     def __iter__(self) -> Iterator[VideoImage]:
         with self.path.open("rb") as file:
             timed = file.read(len(_JPEG_START)) != _JPEG_START
-        images = self._by_opencv() if find_spec("av") is None else self._by_pyav()
-        for image in images:
+        for image in self._images():
             self.read += 1
             self.until = max(self.until, image.seconds or 0.0)
             yield image if timed else image._replace(seconds=None)
         if not self.read:
-            raise VideoError(
-                f"{self.path} holds no image that can be read (pip install av, of the extra video "
-                "of rs_localizer, brings more decoders)"
-            )
+            raise VideoError(f"{self.path} holds no image that can be read")
 
     @property
     def fault(self) -> str | None:
@@ -90,7 +83,7 @@ class Video:
             return None
         return f"{self.path.name} {said}: it is damaged or cut off"
 
-    def _by_pyav(self) -> Iterator[VideoImage]:
+    def _images(self) -> Iterator[VideoImage]:
         most = most_pixels(self.path.stat().st_size)
         with _container(self.path, most) as container:
             stream = _stream(container, most)
@@ -108,7 +101,7 @@ class Video:
                     yield compress(frame.to_ndarray(format="bgr24"), seconds if is_new else None)
 
     def _decoded(self, packet: Any) -> list[Any]:
-        """Decode the images of a packet; a damaged one has none, as in OpenCV."""
+        """Decode the images of a packet; a damaged one has none."""
         import av
 
         try:
@@ -116,33 +109,6 @@ class Video:
         except av.FFmpegError:
             self.damaged += 1
             return []
-
-    def _by_opencv(self) -> Iterator[VideoImage]:
-        # It gives up after this many packets of other streams in a row.
-        os.environ.setdefault("OPENCV_FFMPEG_READ_ATTEMPTS", str(2**31 - 1))
-        most = most_pixels(self.path.stat().st_size)
-        os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = f"max_pixels;{most}"
-        last = -1.0
-        video = cv2.VideoCapture(str(self.path))
-        # Raw rows: a note that the picture should be shown upright turns the shutter, too.
-        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-        with self.path.open("rb") as file:
-            start = file.read(8)
-        if start[4:] == b"ftyp" or start[:4] == b"RIFF":  # elsewhere it is a guess by the rate
-            self.claimed = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-        try:
-            while True:
-                read, color = video.read()
-                if not read:
-                    return
-                # Time of the image just read. OpenCV 4.6 returns 0 for the last images that a
-                # decoder with B frames holds back, and for all images of a raw stream.
-                seconds = 1e-3 * float(video.get(cv2.CAP_PROP_POS_MSEC))
-                is_new = seconds > last
-                last = max(last, seconds)
-                yield compress(color, seconds if is_new else None)
-        finally:
-            video.release()
 
 
 # FFmpeg's AVFMT_NOTIMESTAMPS, of raw streams.

@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from rs_localizer.io import video
 from rs_localizer.io.image_clock import ImageClock
 from rs_localizer.io.video import Video, has_times
 from rs_localizer.offline.image_sources import from_video
+
+av = pytest.importorskip("av", reason="needs PyAV (rs_localizer[video])")
 
 
 def jpegs(count: int) -> list[bytes]:
@@ -68,7 +69,6 @@ def test_rows_stay_as_the_sensor_read_them(tmp_path):
 
 def muxed(path: Path, times: Sequence[int] = range(0, 1200, 100), sound: int = 0) -> Path:
     """Images at times in ms, of grey levels 40, 50 ..., and packets of sound after the sixth."""
-    av = pytest.importorskip("av", reason="needs PyAV (rs_localizer[video])")
     with av.open(str(path), "w") as container:
         film = container.add_stream("mpeg4", rate=1000)
         film.width, film.height, film.pix_fmt = 64, 48, "yuv420p"
@@ -121,8 +121,6 @@ def test_slow_motion_is_said_with_both_rates(tmp_path, captured, rate, said):
 
 def noted(path: Path, out: Path, notes: dict[str, str]) -> None:
     """The same video with notes, as phones write them."""
-    import av
-
     options = {"movflags": "use_metadata_tags"}
     with av.open(str(path)) as given, av.open(str(out), "w", options=options) as made:
         made.metadata.update(notes)
@@ -133,42 +131,14 @@ def noted(path: Path, out: Path, notes: dict[str, str]) -> None:
                 made.mux(packet)
 
 
-def test_an_image_whose_time_is_not_told_has_none(monkeypatch, tmp_path):
-    """As OpenCV 4.6 does with the last images of a video with B frames: it says 0."""
-    muxed(tmp_path / "a.mp4", [0, 33, 66])
-
-    class Forgetful:
-        def __init__(self, name: str) -> None:
-            self.video, self.count = real(name), 0
-            self.set, self.release = self.video.set, self.video.release
-
-        def read(self) -> object:
-            self.count += 1
-            return self.video.read()
-
-        def get(self, what: int) -> float:
-            return 0.0 if self.count == 3 else float(self.video.get(what))
-
-    real = cv2.VideoCapture
-    monkeypatch.setattr(cv2, "VideoCapture", Forgetful)
-    monkeypatch.setattr(video, "find_spec", lambda name: None)  # as without PyAV
-    times = [item.seconds for item in Video(tmp_path / "a.mp4")]
-    assert times == [0.0, pytest.approx(0.033), None]
-
-
-@pytest.mark.parametrize("with_pyav", [True, False])
-def test_packets_of_other_streams_end_no_video(tmp_path, monkeypatch, with_pyav):
-    """OpenCV gives up after 4096 of them in a row."""
+def test_packets_of_other_streams_end_no_video(tmp_path):
     path = muxed(tmp_path / "many.mkv", sound=6000)
-    if not with_pyav:
-        monkeypatch.setattr(video, "find_spec", lambda name: None)
     found = Video(path)
     assert [round(float(item.image.mean()), -1) for item in found] == [*range(40, 160, 10)]
     assert found.fault is None
 
 
-@pytest.mark.parametrize("with_pyav", [True, False])
-def test_a_video_that_is_cut_off_says_so(tmp_path, monkeypatch, with_pyav):
+def test_a_video_that_is_cut_off_says_so(tmp_path):
     """An MP4 whose table of images stands at its front, as after a download that broke off."""
     whole = muxed(tmp_path / "whole.mp4").read_bytes()
     data = bytearray(whole)
@@ -182,8 +152,6 @@ def test_a_video_that_is_cut_off_says_so(tmp_path, monkeypatch, with_pyav):
     path = tmp_path / "cut.mp4"
     path.write_bytes(whole[:at] + tables + images[: len(images) // 2])
     assert path.stat().st_size < size
-    if not with_pyav:
-        monkeypatch.setattr(video, "find_spec", lambda name: None)
     found = Video(path)
     read = len(list(found))
     assert 3 < read < 11
