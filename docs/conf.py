@@ -24,7 +24,7 @@ by_rosdoc2 = "confpy_succeeded" in globals()  # which runs this file inside its 
 PAGES = {
     "Start": "concepts install phone camera common_cameras cameras/index",
     "Use": "node robot reasons wrong_poses detector features imu rigs recordings calibration "
-    "mapping map_build maps simulation integrations examples library policy build_farm",
+    "mapping map_build maps simulation integrations examples library policy",
     "Understand": "limits solvers estimator benchmarks architecture api",
 }
 OTHERS = (

@@ -40,7 +40,7 @@ _POINTER = 8
 
 
 def main(folder: Path, cpu: str, triple: str, modules: Sequence[str] = ()) -> None:
-    """Write ``kernels.o``, ``kernels.bc``, ``table.c`` and ``about.json`` into a folder.
+    """Write ``kernels.o``, ``table.c`` and ``about.json`` into a folder.
 
     Args:
         cpu, triple: LLVM's names of the processor and the machine.
@@ -265,23 +265,13 @@ def _functions(module: Any) -> Iterator[Any]:
     return (function for function in module.functions if not function.is_declaration)
 
 
-def _machine(cpu: str, triple: str) -> Any:
-    llvm.initialize_all_targets()
-    llvm.initialize_all_asmprinters()
-    return llvm.Target.from_triple(triple).create_target_machine(
-        cpu=cpu, features="", opt=3, reloc="pic", codemodel="default"
-    )
-
-
-def assembler_text(bitcode: bytes, cpu: str, triple: str) -> str:
-    """Return the assembler text of ``kernels.bc``."""
-    text: str = _machine(cpu, triple).emit_assembly(llvm.parse_bitcode(bitcode))
-    return text
-
-
 def _emit(merged: Any, folder: Path, cpu: str, triple: str) -> None:
     """Write one module of LLVM, and one object."""
-    machine = _machine(cpu, triple)
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    machine = llvm.Target.from_triple(triple).create_target_machine(
+        cpu=cpu, features="", opt=3, reloc="pic", codemodel="default"
+    )
     merged.triple, merged.data_layout = triple, str(machine.target_data)
     for function in _functions(merged):
         if not function.name.startswith("rs_entry_"):
@@ -294,7 +284,6 @@ def _emit(merged: Any, folder: Path, cpu: str, triple: str) -> None:
         if function.linkage == llvm.Linkage.external:
             function.visibility = "hidden"
     merged.verify()
-    (folder / "kernels.bc").write_bytes(merged.as_bitcode())
     (folder / "kernels.o").write_bytes(machine.emit_object(merged))
     count = sum(1 for _ in _functions(merged))
     (folder / "about.json").write_text(json.dumps({"functions": count, "cpu": cpu}))

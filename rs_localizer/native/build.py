@@ -28,8 +28,6 @@ from rs_localizer.native import levels, sources
 # Numba's versions that make what bitcode.py expects, as in rs_localizer/process/missing.py.
 NUMBA = ((0, 63), (0, 69))
 OBJECTS = "RS_LOCALIZER_OBJECTS"
-ASSEMBLED = Path(__file__).resolve().parent / "assembled"
-"""Where a release branch keeps kernels as assembler text, for who builds without Numba."""
 _HERE = Path(__file__).resolve().parent
 _CPUS = {"v2": "x86-64-v2", "v3": "x86-64-v3", "v4": "x86-64-v4", "generic": "generic"}
 _MACHINES = {level: machine for machine, known in levels.LEVELS.items() for level in known}
@@ -179,13 +177,8 @@ def _build_level(level: str, to: Path, is_portable: bool, is_checkout: bool) -> 
 def _link(level: str, module: Path, key: str, compiler: _Compiler) -> None:
     """Link a level's module from compiled kernels, and compile those that are missing."""
     with tempfile.TemporaryDirectory() as scratch:
-        folder = ASSEMBLED / level
-        if (folder / "kernels.s").is_file():
-            objects = [Path(scratch, "kernels.o")]
-            compiler.run("cc", "-c", folder / "kernels.s", "-o", objects[0])
-        else:
-            folder = _compiled(level, key)
-            objects = [folder / "kernels.o"]
+        folder = _compiled(level, key)
+        objects = [folder / "kernels.o"]
         definitions = (f'-DRS_LEVEL="{level}"', f"-DRS_LEVEL_NAME={level}", "-I", str(_HERE))
         for source in (_HERE / "runtime.c", folder / "table.c"):
             objects.append(Path(scratch, f"{source.stem}.o"))
@@ -217,8 +210,6 @@ def _environment(level: str, is_host: bool) -> dict[str, str]:
 
 def _key(level: str) -> str:
     """Return the digest of all sources and tools that the kernels of a level are compiled with."""
-    if (assembled := ASSEMBLED / level / "kernels.s").is_file():
-        return hashlib.sha256(assembled.read_bytes()).hexdigest()[:16]
     sha = hashlib.sha256(json.dumps(sources.digests()).encode())
     for tool in ("bitcode.py", "jit.py", "declared.py"):
         sha.update((_HERE / tool).read_bytes())
@@ -253,33 +244,10 @@ def _compiled(level: str, key: str) -> Path:
     return folder
 
 
-def assemble(wanted: Sequence[str]) -> None:
-    """Write the kernels of some levels as assembler text into :data:`ASSEMBLED`.
-
-    The build takes them without Numba and LLVM, by a C compiler alone: build farms of distributions
-    have no Numba, and take no binaries.
-    """
-    os.environ["RS_LOCALIZER_KERNELS"] = "build"
-    from rs_localizer.native.bitcode import assembler_text
-
-    for level in wanted:
-        folder, to = _compiled(level, _key(level)), ASSEMBLED / level
-        to.mkdir(parents=True, exist_ok=True)
-        triple = f"{_MACHINES[level]}-unknown-linux-gnu"
-        text = assembler_text((folder / "kernels.bc").read_bytes(), _CPUS[level], triple)
-        (to / "kernels.s").write_text(text)
-        shutil.copy(folder / "table.c", to)
-
-
 def main() -> int:
     """Build into the checkout; return the exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m rs_localizer.native.build", description=__doc__
-    )
-    parser.add_argument(
-        "--assemble",
-        action="store_true",
-        help="write the kernels of these levels as assembler text, for a release branch, and end",
     )
     parser.add_argument(
         "--environment",
@@ -297,10 +265,7 @@ def main() -> int:
         print(*(f"{name}={value}" for name, value in said.items()))
         return 0
     try:
-        if given.assemble:
-            assemble(given.levels or list(_MACHINES))
-        else:
-            build(_HERE, given.levels, is_checkout=True)
+        build(_HERE, given.levels, is_checkout=True)
     except CannotBuild as missing:
         print(f"rs_localizer: {missing}", file=sys.stderr)
         return 1

@@ -10,11 +10,7 @@ Without that digest Numba would run old code after a callee in another file has 
 from __future__ import annotations
 
 import contextlib
-import os
-import stat
-import warnings
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, Self
 
 import numba
@@ -38,7 +34,6 @@ ENTRIES: dict[str, Any] = {}
 """All entries that have been declared so far, by name."""
 
 _SCALARS = {"d": types.float64, "q": types.int64, "?": types.boolean}
-_OTHERS = stat.S_IWGRP | stat.S_IWOTH
 
 
 class _CompiledKernel(CPUDispatcher):
@@ -143,7 +138,8 @@ class _Locator:
     def __init__(self, function: Any, file: str) -> None:
         digest = sources.digest(function.__module__)
         self._py_file = file  # Numba's name, for its warnings
-        self._directory = folder() / digest[:16] / function.__module__
+        kept = sources.PACKAGE.parent / ".kernels"
+        self._directory = kept / digest[:16] / function.__module__
         self._digest, self._line = digest, function.__code__.co_firstlineno
 
     @classmethod
@@ -168,40 +164,15 @@ class _Implementation(CompileResultCacheImpl):
 
 
 class _Cache(FunctionCache):
-    """Machine code in a folder that nobody else can write to; a wrong file is compiled again."""
+    """Machine code of the checkout; a wrong file is compiled again."""
 
     _impl_class = _Implementation
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         with contextlib.suppress(Exception):  # half a file, or one of another program
-            if is_ours(Path(self._cache_path)):
-                return super().load_overload(signature, target)
+            return super().load_overload(signature, target)
         return None
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
-        if is_ours(Path(self._cache_path)):
-            with contextlib.suppress(OSError):  # a full disk, or a folder that is read-only
-                super().save_overload(signature, compiled)
-
-
-def folder() -> Path:
-    """Return where machine code is kept: beside the package, in the checkout."""
-    return sources.PACKAGE.parent / ".kernels"
-
-
-def is_ours(path: Path) -> bool:
-    """Return True if nobody else can write to a folder, whose files run in this process."""
-    for each in (path, *path.parents):
-        try:
-            about = each.stat()
-        except FileNotFoundError:  # it will be made for this user
-            continue
-        # In a sticky folder such as /tmp nobody can replace another user's files.
-        is_sticky = each != path and about.st_mode & stat.S_ISVTX
-        if about.st_uid not in {0, os.geteuid()} or (about.st_mode & _OTHERS and not is_sticky):
-            warnings.warn(
-                f"kernels in {folder()} are not used, since other users can write to {each}: "
-                "chmod -R go-w, or remove it", RuntimeWarning, 2,
-            )  # fmt: skip
-            return False
-    return True
+        with contextlib.suppress(OSError):  # a full disk, or a folder that is read-only
+            super().save_overload(signature, compiled)

@@ -65,8 +65,7 @@ def test_files_of_the_repository_in_commands_exist(page):
     known = ("rs_localizer/", "examples/", "config/", "packaging/", "benchmarks/")
     words = {word for line in pages.shell(page) for word in line.split() if word.startswith(known)}
     missing = {word for word in words if not (pages.ROOT / word).exists() and "NAME" not in word}
-    # `packaging/conda` and the like are folders; assembler text is there in release branches only.
-    assert missing - {"rs_localizer/native/assembled"} == set()
+    assert missing == set()
 
 
 @pytest.mark.parametrize(("page", "module", "words"), _MODULES)
