@@ -12,11 +12,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from rs_localizer.cli import WORKING, earlier_result
+from rs_localizer.cli import WORKING, earlier_result, refuse_existing
 from rs_localizer.cli.image_input import ImageOptions
 from rs_localizer.cli.options import FleetOptions, ResultOptions, UsageError, argument, option
 from rs_localizer.cli.settings_args import given_topics, given_values
-from rs_localizer.io.atomic_files import atomic_directory, check_writable
+from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import is_bag, open_bag
 from rs_localizer.io.recording import BRIDGED, RESULT
 from rs_localizer.io.trajectories import POSES_FILE as POSES
@@ -40,8 +40,6 @@ if WORKING:
     from rs_localizer.settings import build
 
 if TYPE_CHECKING:
-    from pyarrow import Table  # an extra
-
     from rs_localizer.cli import detect_command  # of images only
 
 _ORB_BYTES = 32  # of a descriptor; AKAZE's has 61
@@ -79,7 +77,10 @@ class Options(ImageOptions, FleetOptions, ResultOptions):
 
 
 def run(options: Options) -> Figures | None:
-    _check_place(options)
+    if (table := options.parquet) is not None:
+        frame_table.schema()  # what is not installed is said now
+        if table.is_file() or not table.exists():  # else it takes all that comes: /dev/stdout
+            refuse_existing(options, table)
     if options.pose_rate is not None and not options.smooth:
         raise UsageError("--pose-rate goes with --smooth")
     if len(options.recordings) > 1 or options.workers or options.scheduler:
@@ -90,28 +91,7 @@ def run(options: Options) -> Figures | None:
     return {"out": str(out)} | figures(_replay_one(options, recording, out))
 
 
-def _check_place(options: Options) -> None:
-    """Refuse a table that could not be written, or would replace something else, before the work.
-
-    Raises:
-        ValueError: naming the place.
-    """
-    file = options.parquet
-    if file is None:
-        return
-    frame_table.schema()  # what is not installed is said now
-    check_writable(file)
-    if not file.is_file():
-        return  # nothing is there, or what takes all that comes, such as /dev/stdout
-    with file.open("rb") as content:
-        if content.read(4) != b"PAR1":
-            raise ValueError(f"{file} is no earlier result of --parquet, and stays as it is")
-    if not options.overwrite:
-        raise ValueError(f"{file} exists; choose another --parquet, or --overwrite")
-
-
 def _settings(options: Options) -> NodeConfig:
-    """Return the settings that the options give."""
     files = {"map_file": options.map, "camera_file": options.calibration}
     given = {name: str(file) for name, file in files.items() if file is not None}
     return build(given_values(options) | given)
@@ -127,10 +107,9 @@ def _pictures(recording: Path) -> str:
 
 def _replay_one(options: Options, recording: Path, out: Path, timed: bool = True) -> Tally:
     """Replay a recording into ``out``, and say what came of it (``timed``: how fast, too)."""
-    pictures = _pictures(recording)
-    if not pictures and options.rate is not None:
-        raise UsageError("--rate is that of images without times; poses at a rate are --pose-rate")
-    if not pictures:
+    if not (pictures := _pictures(recording)):
+        if options.rate is not None:
+            raise UsageError("--rate is of images without times; poses at a rate are --pose-rate")
         return _replay_matches(options, recording, recording, out, timed)
     if options.map is None:
         lens = "" if is_bag(recording) else ", and --camera, as calibrate writes it"
@@ -141,33 +120,23 @@ def _replay_one(options: Options, recording: Path, out: Path, timed: bool = True
 
     with TemporaryDirectory() as place:
         matches = Path(place) / "matches"
-        of_images = _detection(options, recording, matches)
-        by_markers = of_images.features is None
+        of_images = _detection(options, recording, options.map, matches)
         detect_command.detect(of_images)
         # The given settings are in the file beside the matches now, with those of the video.
         own = matches / PARAMETERS
         alone = replace(
             options, params=own if own.exists() else None, assignments=[], rate=None,
-            map=None if by_markers else _map_file(options.map), remaps=[], calibration=None,
+            map=_map_file(options.map) if of_images.features else None, remaps=[],
+            calibration=None,
         )  # fmt: skip
         return _replay_matches(alone, matches, recording, out, timed)
 
 
-def _map_file(place: Path) -> Path:
-    """Return the file of the landmarks, also in a result of map build."""
-    return place / MAP if (place / MAP).is_file() else place
-
-
-def _detection(options: Options, recording: Path, out: Path) -> detect_command.Options:
-    """Return the options of ``detect`` that find the matches of images."""
+def _detection(options: Options, recording: Path, place: Path, out: Path) -> detect_command.Options:
+    """Return the options of ``detect`` that find the matches of images with the map ``place``."""
     from rs_localizer.cli import detect_command
 
-    place = options.map
-    assert place is not None
     by_markers = is_marker_file(place)
-    features = None
-    if not by_markers:
-        features = _features_of(read_map_file(_map_file(place), MAP_FRAME))
     calibration, params = options.calibration, options.params
     if (place / MAP).is_file():  # a result of map build; a bag has a lens of its own
         if is_bag(recording):
@@ -175,10 +144,16 @@ def _detection(options: Options, recording: Path, out: Path) -> detect_command.O
         else:
             calibration = calibration or place / CAMERA
     return detect_command.Options(
-        recording=recording, out=out, map=place if by_markers else None, features=features,
+        recording=recording, out=out, map=place if by_markers else None,
+        features=None if by_markers else _features_of(read_map_file(_map_file(place), MAP_FRAME)),
         calibration=calibration, params=params, assignments=options.assignments,
         remaps=options.remaps, rate=options.rate,
     )  # fmt: skip
+
+
+def _map_file(place: Path) -> Path:
+    """Return the file of the landmarks, also in a result of map build."""
+    return place / MAP if (place / MAP).is_file() else place
 
 
 def _features_of(landmarks: Map) -> str:
@@ -229,30 +204,14 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
                 smooth = functools.partial(smooth_frames, localizer, rate=options.pose_rate)
             tally.done = bar.update
             write_results(bag, topics, localizer, tally, built, smooth)
-        _print_summary(tally, config, out, timed)
+        print(*summary(tally, config, out, timed), sep="\n")
         if tally.table is not None and options.parquet is not None:
-            _write_table([tally.table.table()], options.parquet)
+            print(frame_table.write_parquet([tally.table.table()], options.parquet))
         if not tally.localized:
             raise ValueError(
                 f"no frame of {recording} was localized; of the last one, {tally.last_refusal}"
             )
     return tally
-
-
-def _write_table(tables: list[Table], file: Path) -> None:
-    rows = frame_table.write_parquet(tables, file)
-    print(f"written to {file}: {rows} rows, one a frame")
-
-
-def _print_summary(tally: Tally, config: NodeConfig, out: Path, timed: bool) -> None:
-    print("\n".join(summary(tally, config, timed)))
-    if tally.localized and not tally.moving:
-        why = f"solver {config.solver} estimates no velocities"
-        if config.readout_time == 0.0:
-            why = "readout_time is 0 (unknown); give it with -p readout_time:=SECONDS"
-        print(f"no twists: {why}")
-    bridged = f", {BRIDGED}" if tally.smoothed else ""
-    print(f"written to {out}: {POSES}, {f'{TWISTS}, ' if tally.moving else ''}{RESULT}{bridged}")
 
 
 def _replay_all(options: Options) -> None:
@@ -267,23 +226,23 @@ def _replay_all(options: Options) -> None:
     config = _settings(options)  # refuses wrong ones before there are workers
     if options.map is None and config.map_file:  # where it is from here, not from a worker
         options = replace(options, map=Path(config.map_file))
-    params, landmarks, lens = (
+    params, landmarks, lens = files = [
         None if place is None else place.absolute()
         for place in (options.params, options.map, options.calibration)
-    )
+    ]
     own = replace(
         options, recordings=[], out=None, overwrite=False, workers=None, scheduler=None,
         params=params, map=landmarks, calibration=lens,
         parquet=None if options.parquet is None else Path(TABLE),
     )  # fmt: skip
-    changed = [file.stat().st_mtime_ns for file in (params, landmarks, lens) if file is not None]
+    changed = [file.stat().st_mtime_ns for file in files if file is not None]
     work = functools.partial(_replay_of_many, own)
     tasks = fleet.tasks_of(options.recordings, out.absolute(), work, repr((own, changed)))
     if not options.overwrite:
         fleet.refuse_others(tasks)
-    before = sum(fleet.finished(task) is not None for task in tasks)
-    print(f"{before} of {len(tasks)} recordings have been done before")
-    with tqdm(total=len(tasks) - before, unit="recording", disable=None) as bar:
+    left = sum(fleet.finished(task) is None for task in tasks)
+    print(f"{len(tasks) - left} of {len(tasks)} recordings have been done before")
+    with tqdm(total=left, unit="recording", disable=None) as bar:
 
         def heard(task: Task, outcome: Outcome) -> None:
             bar.update()
@@ -293,9 +252,8 @@ def _replay_all(options: Options) -> None:
     print(f"written to {out / fleet.SUMMARY}")
     done = [task for task in tasks if not isinstance(outcomes[task.folder], str)]
     if options.parquet is not None:
-        _write_table(
-            [frame_table.read_parquet(task.folder / TABLE) for task in done], options.parquet
-        )
+        tables = [frame_table.read_parquet(task.folder / TABLE) for task in done]
+        print(frame_table.write_parquet(tables, options.parquet))
     if failed := len(tasks) - len(done):
         raise ValueError(
             f"{failed} of {len(tasks)} recordings failed; {out / fleet.SUMMARY} says why"

@@ -183,8 +183,8 @@ def _localized(frame: Localized) -> dict[str, Any]:
     return row
 
 
-def write_parquet(tables: Iterable[Table], place: Path) -> int:
-    """Write tables one after the other into one Parquet file; how many rows.
+def write_parquet(tables: Iterable[Table], place: Path) -> str:
+    """Write tables one after the other into one Parquet file; return a sentence on it.
 
     The bytes depend on the rows and the version of pyarrow: each table is a row group.
 
@@ -204,7 +204,7 @@ def write_parquet(tables: Iterable[Table], place: Path) -> int:
         for table in tables:
             rows += table.num_rows
             writer.write_table(table.combine_chunks(), row_group_size=max(table.num_rows, 1))
-    return rows
+    return f"written to {place}: {rows} rows, one a frame"
 
 
 def read_parquet(file: Path) -> Table:

@@ -278,10 +278,12 @@ _RESTARTS = ("time_went_back", "map_changed")
 _WIDTH = 96  # columns of a terminal that is not narrow
 
 
-def summary(tally: Tally, config: NodeConfig, timed: bool = True) -> list[str]:
+def summary(tally: Tally, config: NodeConfig, out: Path, timed: bool = True) -> list[str]:
     """Return the lines of a table, with the reasons of refusals explained below.
 
-    ``timed``: whether to say how fast, which is never the same twice.
+    Args:
+        out: where the results are.
+        timed: whether to say how fast, which is never the same twice.
     """
     rows: list[tuple[str, object]] = [("frames", tally.total), ("localized", tally.localized)]
     rows += [(f"  refused: {reason}", n) for reason, n in tally.refused.most_common()]
@@ -327,7 +329,14 @@ def summary(tally: Tally, config: NodeConfig, timed: bool = True) -> list[str]:
             lines += textwrap.wrap(f"{name}: {text}", _WIDTH, subsequent_indent="    ")
     if (fault := readout_fault(config.readout_time, tally.period)) is not None:
         lines.append(f"warning: {fault}")
-    return lines
+    if tally.localized and not tally.moving:
+        why = f"solver {config.solver} estimates no velocities"
+        if config.readout_time == 0.0:
+            why = "readout_time is 0 (unknown); give it with -p readout_time:=SECONDS"
+        lines.append(f"no twists: {why}")
+    files = [POSES_FILE, *([TWISTS_FILE] if tally.moving else []), RESULT]
+    files += [BRIDGED] if tally.smoothed else []
+    return [*lines, f"written to {out}: {', '.join(files)}"]
 
 
 def figures(tally: Tally) -> Figures:
