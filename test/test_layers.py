@@ -171,7 +171,8 @@ def test_every_module_has_a_client() -> None:
         for path, text in texts.items()
         for name in imported(text, ".".join(path.relative_to(PACKAGE.parent).parts[:-1]))
     }
-    launch = [path.read_text() for path in PACKAGE.parent.glob("launch/*.py")]
+    root = PACKAGE.parent
+    starts = [path.read_text() for path in (root / "setup.py", *root.glob("launch/*.py"))]
     orphans = []
     for path in texts:
         module = ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
@@ -180,7 +181,7 @@ def test_every_module_has_a_client() -> None:
             continue
         if any(f"{name}.".startswith(f"{module}.") for name in names):
             continue
-        others = [*launch, *(text for where, text in texts.items() if where != path)]
+        others = [*starts, *(text for where, text in texts.items() if where != path)]
         if not any(name in text for name in late for text in others):
             orphans.append(module)
     assert orphans == []

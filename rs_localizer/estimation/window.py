@@ -104,7 +104,7 @@ class Gaussian(NamedTuple):
 
 
 class MotionSample(NamedTuple):
-    """What the points of a frame tell of its motion; s, m and rad."""
+    """The estimate that the points of a frame give of its motion; s, m and rad."""
 
     time_ns: int
     state: Array  # (24,) the frame's estimate
