@@ -27,8 +27,7 @@ from benchmarks.independent.motions import hand
 from benchmarks.independent.rotations import Array, logarithm
 from benchmarks.independent.scenes import Rich, Scene, Wall
 from rs_localizer.core.types import Estimate
-from rs_localizer.inertial.buffer import ReadingBuffer
-from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.inertial.samples import SampleBuffer
 from rs_localizer.inertial.status import Unused
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
@@ -72,7 +71,7 @@ class Found:
 def followed(recorded: Recorded, with_imu: bool = True) -> Found:
     """Track the frames of each recording with the gyroscope's readings, or the camera alone."""
     frames, rows, used, said = recorded.frames, [], 0, ""
-    tracker, buffer = Tracker(Localizer(believed(frames.camera))), ReadingBuffer()
+    tracker, buffer = Tracker(Localizer(believed(frames.camera))), SampleBuffer()
     half_ns = round(0.5e9 * frames.camera.readout_time)
     for frame in range(len(frames)):
         middle_ns, which = frames.middle_ns(frame), int(frames.recording[frame])
@@ -80,7 +79,7 @@ def followed(recorded: Recorded, with_imu: bool = True) -> Found:
             tracker = Tracker(
                 Localizer(believed(frames.camera)), recorded.aid() if with_imu else None
             )
-            buffer, every = ReadingBuffer(), recorded.samples[which]
+            buffer, every = SampleBuffer(), recorded.samples[which]
             heard = 0
         samples = None
         if with_imu:
@@ -96,7 +95,7 @@ def followed(recorded: Recorded, with_imu: bool = True) -> Found:
             if isinstance(found, Unused):
                 said = found.reason.removeprefix("imu_")
             else:
-                samples = ImuSamples(found.stamps_ns, found.angular_velocities)
+                samples = found
         result = tracker.localize(middle_ns, *frames.seen(frame, _NOISE), readings=samples)
         if samples is not None and tracker.aid is not None:
             status = tracker.aid.status

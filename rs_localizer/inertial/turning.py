@@ -28,13 +28,11 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array, Array1, Array2
-from rs_localizer.core.blocks import median, write
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.rate_spline import rotations_at_knots, spline, turns_at
 from rs_localizer.core.rotation_prior import NODES, parts_of
 from rs_localizer.core.shake import COMBINATIONS, MIDDLE_RATES, RESOLVED, shake_functions
-from rs_localizer.inertial.samples import ImuSamples
-from rs_localizer.native import entry
+from rs_localizer.inertial.samples import MARGIN, ImuSamples
 
 PARAMETERS = 10
 """Number of a gyroscope's errors; their places are BIAS, DELAY, SCALE and MOUNT."""
@@ -61,74 +59,26 @@ _TAU = np.linspace(-0.5, 0.5, 41)
 
 # End of the spectrum, as a part of the sample rate, and noise beside it (variance).
 _BAND, _NOISE = 0.4, 1e-5
-# With more samples than this in an exposure they are dense enough, and solving for them would take
-# time.
+# With more samples than this about an exposure they are dense enough, and solving for them would
+# take time.
 _MOST = 64
 
 
-def _densified(times: Array, rates: Array) -> tuple[Array, Array]:
-    """Add samples between the last ones, which are the frame's."""
-    late = max(len(times) - _MOST, 0)
-    dense, found = densified(times[late:].copy(), rates[late:].copy())
-    return np.concatenate([times[:late], dense]), np.concatenate([rates[:late], found])
-
-
-@entry
-def densified(times: Array1, rates: Array2) -> tuple[Array, Array]:
+def densified(times: Array, rates: Array) -> tuple[Array, Array]:
     """Return times (2 n - 1,) and rates (2 n - 1,3): the given ones, and one between each two.
 
     Args:
         times: (n,) increasing, s; they need not be regular.
         rates: (n,3) at these times.
     """
-    count = len(times)
-    if not 3 < count <= _MOST:
+    if not 3 < len(times) <= _MOST:
         return times, rates
-    steps = np.empty(count - 1)
-    for i in range(count - 1):
-        steps[i] = times[i + 1] - times[i]
-    width = 2.0 * np.pi * _BAND / median(steps)
-    # The sine of a difference by those of both: n of them, not n^2.
-    sines, cosines = np.sin(width * times), np.cos(width * times)
-    factor = np.empty((count, count))
-    # The mean has no prior.
-    mean = np.zeros(3)
-    for i in range(count):
-        for axis in range(3):
-            mean[axis] += rates[i, axis] / count
-    solved = rates - mean
-    for i in range(count):  # Cholesky, and the first substitution beside it
-        for j in range(i + 1):
-            sine = sines[i] * cosines[j] - cosines[i] * sines[j]
-            total = 1.0 + _NOISE if i == j else sine / (width * (times[i] - times[j]))
-            for k in range(j):
-                total -= factor[i, k] * factor[j, k]
-            factor[i, j] = np.sqrt(max(total, _NOISE * _NOISE)) if i == j else total / factor[j, j]
-        for axis in range(3):
-            left = solved[i, axis]
-            for k in range(i):
-                left -= factor[i, k] * solved[k, axis]
-            solved[i, axis] = left / factor[i, i]
-    for i in range(count - 1, -1, -1):
-        for axis in range(3):
-            left = solved[i, axis]
-            for k in range(i + 1, count):
-                left -= factor[k, i] * solved[k, axis]
-            solved[i, axis] = left / factor[i, i]
-    dense, found = np.empty(2 * count - 1), np.zeros((2 * count - 1, 3))
-    for i in range(count):
-        dense[2 * i] = times[i]
-        write(found[2 * i], rates[i])
-        if i + 1 < count:
-            between = 0.5 * (times[i] + times[i + 1])
-            write(found[2 * i + 1], mean)
-            dense[2 * i + 1] = between
-            here, aside = np.sin(width * between), np.cos(width * between)
-            for k in range(count):
-                sine = here * cosines[k] - aside * sines[k]
-                weight = sine / (width * (between - times[k]))
-                for axis in range(3):
-                    found[2 * i + 1, axis] += weight * solved[k, axis]
+    wanted = 0.5 * (times[1:] + times[:-1])
+    per_second, mean = 2.0 * _BAND / float(np.median(np.diff(times))), rates.mean(axis=0)
+    own, across = (np.sinc(per_second * (t[:, None] - times)) for t in (times, wanted))
+    between = across @ np.linalg.solve(own + _NOISE * np.eye(len(times)), rates - mean) + mean
+    dense, found = np.empty(2 * len(times) - 1), np.empty((2 * len(times) - 1, 3))
+    dense[::2], dense[1::2], found[::2], found[1::2] = times, wanted, rates, between
     return dense, found
 
 
@@ -220,7 +170,13 @@ def read(
     last = int(samples.times_ns.searchsorted(samples.times_ns[span][-1] + reach_ns, "right"))
     times = np.asarray(1e-9 * (samples.times_ns[first:last] - here_ns), np.float64)
     period = float(times[-1] - times[0]) / (len(times) - 1)
-    dense, found = _densified(times, errors.corrected(samples.angular_velocity[first:last]))
+    found = errors.corrected(samples.angular_velocity[first:last])
+    reach = half + 1e-9 * reach_ns + MARGIN * period
+    near = slice(int(times.searchsorted(-reach)), int(times.searchsorted(reach)))
+    dense, found = (
+        np.concatenate([of[: near.start], within, of[near.stop :]])
+        for of, within in zip((times, found), densified(times[near], found[near]), strict=True)
+    )
     delays, weights = _delays(deviation, period)
     # All that follows is by readings that are so much later.
     grid = readout_time * _TAU

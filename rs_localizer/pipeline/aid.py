@@ -16,13 +16,11 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.config import Imu, ImuUse, NodeConfig
-from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import ImuReason
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.known_rotation import Aid
-from rs_localizer.inertial.buffer import LONGEST_PERIOD_NS, ReadingBuffer, Readings
-from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.inertial.samples import ImuSamples, SampleBuffer
 from rs_localizer.inertial.status import InertialSettings, InertialStatus, Unused
 from rs_localizer.io.imu import ImuReading
 from rs_localizer.io.transforms import TransformError, Transforms
@@ -42,8 +40,6 @@ _SOME = 30
 
 # s: drivers stamp images and readings some milliseconds off; who gives an offset has measured it.
 _ANY_OFFSET, _GIVEN_OFFSET = 0.02, 0.002
-# Hz: at less, a shaking of 30 Hz turns by half a cycle between two readings.
-_LEAST_RATE = 1e9 / LONGEST_PERIOD_NS
 
 
 def in_words(unused: Unused) -> str:
@@ -115,7 +111,7 @@ class AidInput:
 
     def __init__(self, notice: Notify) -> None:
         self._notice = notice
-        self._buffer = ReadingBuffer()
+        self._buffer = SampleBuffer()
         self._recently: deque[Unused | None] = deque(maxlen=_MANY)
         self._force_in_map = np.zeros(3)  # mean of the last frames
         self._with_force = 0  # how many
@@ -191,7 +187,8 @@ class AidInput:
             reason = ImuReason.NO_READOUT_TIME if unknown else ImuReason.NOT_TRACKING
             self._count(config, None, Unused(reason))
             return localized(None)
-        samples = self._samples_of(frame)
+        start_ns, end_ns = frame.exposure()
+        samples = self._samples(frame, start_ns, end_ns, end_ns + _AROUND_NS)
         if isinstance(samples, Unused):
             result = localized(None)
             self._count(config, tracker, samples)
@@ -221,25 +218,18 @@ class AidInput:
     def _wanted(self, config: NodeConfig) -> bool:
         return config.imu.use != ImuUse.NONE and self.frame != ""
 
-    def _samples_of(self, frame: Moment) -> ImuSamples | Unused:
-        start_ns, end_ns = frame.exposure()
-        samples = self._samples(frame, start_ns, end_ns, end_ns + _AROUND_NS)
-        late = isinstance(samples, Unused) and samples.reason is ImuReason.LATE
-        if late and self._buffer.rate() < _LEAST_RATE:  # why they are late, and what is to be said
-            return Unused(ImuReason.TOO_SLOW, f"{self._buffer.rate():.0f} Hz")
-        return samples
-
     def _samples(
         self, at: Moment, start_ns: int, end_ns: int, until_ns: int
     ) -> ImuSamples | Unused:
         """Return readings that cover a span, and those before and after it."""
-        readings = self._buffer.between(start_ns, end_ns, start_ns - _BEFORE_NS, until_ns)
-        if isinstance(readings, Unused):
-            return readings
-        times_ns = readings.stamps_ns + round(1e9 * at.config.imu.time_offset)
+        samples = self._buffer.between(start_ns, end_ns, start_ns - _BEFORE_NS, until_ns)
+        if isinstance(samples, Unused):
+            return samples
+        times_ns = samples.times_ns + round(1e9 * at.config.imu.time_offset)
         try:
             frames = at.camera_frame, self.frame
-            return in_camera_axes(readings, times_ns, at.transforms, frames, at.time_ns)
+            samples = in_camera_axes(samples, at.transforms, frames, at.time_ns)
+            return replace(samples, times_ns=times_ns)
         except TransformError as error:
             text = f"from the IMU {self.frame!r} to the camera {at.camera_frame!r}: {error}"
             return Unused(ImuReason.NO_TRANSFORM, text)
@@ -301,19 +291,13 @@ def inertial_settings(config: NodeConfig) -> InertialSettings:
 
 
 def in_camera_axes(
-    readings: Readings,
-    times_ns: IntArray,
-    transforms: Transforms,
-    frames: tuple[str, str],
-    now_ns: int,
+    samples: ImuSamples, transforms: Transforms, frames: tuple[str, str], now_ns: int
 ) -> ImuSamples:
-    """Convert readings from the axes of the IMU to samples in those of the camera.
+    """Return samples in the axes of the camera, of those in the axes of the IMU.
 
     Lever arms do not change a rate; their effect on a force is neglected.
 
     Args:
-        readings: n of them, in the IMU's axes.
-        times_ns: (n,) when they were taken, by the camera's clock.
         transforms: where the two frames are.
         frames: of the camera, and of the IMU.
         now_ns: when a mounting counts that may be another one later: of a head that rests.
@@ -322,9 +306,12 @@ def in_camera_axes(
         TransformError: when the transform is not known for that time.
     """
     camera, imu = frames
-    rates, forces = readings.angular_velocities, readings.specific_forces
     if camera == imu:
-        return ImuSamples(times_ns, rates, forces)
+        return samples
     timed = now_ns > 0 and transforms.moves(camera, imu)
     turn = transforms.lookup(camera, imu, now_ns if timed else None).rotation.T
-    return ImuSamples(times_ns, rates @ turn, None if forces is None else forces @ turn)
+    force = samples.specific_force
+    return replace(
+        samples, angular_velocity=samples.angular_velocity @ turn,
+        specific_force=None if force is None else force @ turn,
+    )  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.core.reasons import ImuReason
-from rs_localizer.inertial.buffer import MEMORY_NS, MOST, ReadingBuffer, Readings
+from rs_localizer.inertial.samples import MEMORY_NS, MOST, ImuSamples, SampleBuffer
 from rs_localizer.inertial.status import Unused
 
 MS = 1_000_000
@@ -20,16 +20,16 @@ def stamps(count: int, period: int = PERIOD, start: int = START) -> list[int]:
     return [start + i * period for i in range(count)]
 
 
-def filled(times: list[int]) -> ReadingBuffer:
+def filled(times: list[int]) -> SampleBuffer:
     """Each reading says when it was taken, in s since the start."""
-    buffer = ReadingBuffer()
+    buffer = SampleBuffer()
     for time in times:
         seconds = (time - START) * 1e-9
         buffer.add(time, "imu", (seconds, 0.0, -seconds), (0.0, seconds, 9.8))
     return buffer
 
 
-def lack(found: Readings | Unused) -> ImuReason | None:
+def lack(found: ImuSamples | Unused) -> ImuReason | None:
     return found.reason if isinstance(found, Unused) else None
 
 
@@ -37,15 +37,15 @@ def test_an_exposure_gets_its_readings_and_one_on_either_side():
     buffer = filled(stamps(400))
     start, end = START + 501 * MS, START + 531 * MS
     found = buffer.between(start, end)
-    assert found.stamps_ns[0] <= start < found.stamps_ns[1]
-    assert found.stamps_ns[-2] < end <= found.stamps_ns[-1]
-    assert np.diff(found.stamps_ns).tolist() == [PERIOD] * (len(found.stamps_ns) - 1)
-    seconds = (found.stamps_ns - START) * 1e-9
-    np.testing.assert_allclose(found.angular_velocities[:, 0], seconds)
-    np.testing.assert_allclose(found.specific_forces[:, 1], seconds)
+    assert found.times_ns[0] <= start < found.times_ns[1]
+    assert found.times_ns[-2] < end <= found.times_ns[-1]
+    assert np.diff(found.times_ns).tolist() == [PERIOD] * (len(found.times_ns) - 1)
+    seconds = (found.times_ns - START) * 1e-9
+    np.testing.assert_allclose(found.angular_velocity[:, 0], seconds)
+    np.testing.assert_allclose(found.specific_force[:, 1], seconds)
     # Ends that are stamps themselves need no more.
     exact = buffer.between(START + 500 * MS, START + 530 * MS)
-    assert exact.stamps_ns[[0, -1]].tolist() == [START + 500 * MS, START + 530 * MS]
+    assert exact.times_ns[[0, -1]].tolist() == [START + 500 * MS, START + 530 * MS]
     assert buffer.rate() == pytest.approx(400.0)
 
 
@@ -57,12 +57,12 @@ def test_order_and_repetition_do_not_matter():
     buffer, ordered = filled(mixed), filled(times)
     assert len(buffer) == len(times)
     pair = [b.between(START + 401 * MS, START + 433 * MS) for b in (buffer, ordered)]
-    assert pair[0].stamps_ns.tolist() == pair[1].stamps_ns.tolist()
-    assert pair[0].angular_velocities.tolist() == pair[1].angular_velocities.tolist()
+    assert pair[0].times_ns.tolist() == pair[1].times_ns.tolist()
+    assert pair[0].angular_velocity.tolist() == pair[1].angular_velocity.tolist()
 
 
 def test_what_is_missing_is_told():
-    assert lack(ReadingBuffer().between(START, START + 30 * MS)) == ImuReason.NEVER
+    assert lack(SampleBuffer().between(START, START + 30 * MS)) == ImuReason.NEVER
     buffer = filled(stamps(400))  # until 997.5 ms
     not_yet = buffer.between(START + 980 * MS, START + 1010 * MS)
     assert lack(not_yet) == ImuReason.LATE
@@ -101,7 +101,7 @@ def test_the_end_of_the_range_is_noticed():
     turn = 6.0 * np.sin(2.0 * np.pi * 3.0 * np.arange(400) * 2.5e-3)
     noisy = turn + 1e-3 * rng.normal(size=400)
     for limit, expected in ((4.36, ImuReason.SATURATED), (100.0, None)):
-        buffer = ReadingBuffer()
+        buffer = SampleBuffer()
         for time, rate in zip(stamps(400), np.clip(noisy, -limit, limit).tolist(), strict=True):
             buffer.add(time, "imu", (0.0, rate, 0.0))
         # The peak of the sine lies at 1/12 s + k/3 s.
@@ -118,9 +118,9 @@ def test_memory_is_bounded():
     times = stamps(20_000)
     buffer = filled(times)
     found = buffer.between(times[-20], times[-10], times[0])
-    assert found.stamps_ns[0] == times[-1] - MEMORY_NS
+    assert found.times_ns[0] == times[-1] - MEMORY_NS
     # So many that a second holds more than can be remembered, also all behind the newest.
-    rush = ReadingBuffer()
+    rush = SampleBuffer()
     for i in range(40_000):
         rush.add(START + 10_000 * i, "imu", (0.0, 0.0, 0.0))
         rush.add(START + 10_000 * i - 5_000, "imu", (0.0, 0.0, 0.0))

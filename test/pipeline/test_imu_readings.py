@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.config import Imu, NodeConfig
 from rs_localizer.core.reasons import ImuReason
-from rs_localizer.inertial.buffer import Readings
+from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.io.bags import make_message, open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.imu import read_imu
@@ -233,8 +233,8 @@ FRAMES = ("camera", "imu")
 RNG = np.random.default_rng(0)
 
 
-def readings(rates: Any, forces: Any = None) -> Readings:
-    return Readings(TIMES, rates, forces)
+def readings(rates: Any, forces: Any = None) -> ImuSamples:
+    return ImuSamples(TIMES, rates, forces)
 
 
 def tree(samples: dict[int, Rotation], static: bool) -> TransformTree:
@@ -251,7 +251,7 @@ def test_a_fixed_mounting_turns_rates_and_forces():
     rates, forces = RNG.normal(size=(2, len(TIMES), 3))
     moving = {NOW - 9 * MS: mounting, NOW + 9 * MS: mounting}
     for transforms in (tree({0: mounting}, True), tree(moving, False)):
-        found = in_camera_axes(readings(rates, forces), TIMES, transforms, FRAMES, NOW)
+        found = in_camera_axes(readings(rates, forces), transforms, FRAMES, NOW)
         np.testing.assert_allclose(found.angular_velocity, mounting.apply(rates), atol=1e-12)
         np.testing.assert_allclose(found.specific_force, mounting.apply(forces), atol=1e-12)
         assert found.times_ns is TIMES
@@ -260,7 +260,7 @@ def test_a_fixed_mounting_turns_rates_and_forces():
 def test_one_frame_needs_no_transform():
     rates = RNG.normal(size=(len(TIMES), 3))
     empty = TransformTree()
-    found = in_camera_axes(readings(rates), TIMES, empty, ("a", "a"), NOW)
+    found = in_camera_axes(readings(rates), empty, ("a", "a"), NOW)
     assert found.angular_velocity is rates
     with pytest.raises(TransformError, match="does not exist"):
-        in_camera_axes(readings(rates), TIMES, empty, FRAMES, NOW)
+        in_camera_axes(readings(rates), empty, FRAMES, NOW)
