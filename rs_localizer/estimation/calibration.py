@@ -143,11 +143,18 @@ def calibration_effect(
     still, of_pose = math.inf, inverted(every[POSE, POSE].copy())
     if math.isfinite(of_pose[0, 0]):
         still = longest_axis(posterior.inflation * variance * of_pose)
-    products, crossed = every[:fitted, :fitted].copy(), every[:fitted, fitted:]
-    products.flat[PARAMETERS * (fitted + 1) :: fitted + 1] += variance
-    of_errors = crossed[:PARAMETERS]
+    motion, crossed = slice(0, PARAMETERS), every[:fitted, fitted:]
+    of_motion, of_errors = every[motion, motion], crossed[motion]
     if tracked:  # else the covariance has what the smooth error does
         crossed = np.hstack([crossed, variance * np.eye(fitted)[:, PARAMETERS:]])
+    # The smooth error is taken out, for all speeds.
+    beside = every[PARAMETERS:fitted, :PARAMETERS]
+    own = every[PARAMETERS:fitted, PARAMETERS:fitted] + variance * np.eye(fitted - PARAMETERS)
+    explained = np.linalg.solve(own, beside).T
+    information, crossed = (
+        of_motion - explained @ beside,
+        crossed[motion] - explained @ crossed[PARAMETERS:],
+    )
     pull, taken = np.zeros((MOTION_PARAMETERS, crossed.shape[1])), np.zeros_like(of_errors)
     for speed, part in zip(SPEEDS, parts.tolist(), strict=True):
         if part < _NO_PART:
@@ -155,16 +162,13 @@ def calibration_effect(
         prior, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
         of_speed = terms_at(terms, speed, rotation is not None)
         add_prior(of_speed, posterior.state, variance, prior, slope)
-        information = products.copy()
-        information[:PARAMETERS, :PARAMETERS] += prior
-        inverse = inverted(information)
+        inverse = inverted(information + prior)
         if not math.isfinite(inverse[0, 0]):
             return NO_EFFECT._replace(still_deviation=still)
         pull -= part * (inverse[:MOTION_PARAMETERS] @ crossed)
-        taken += part * (inverted(products[:PARAMETERS, :PARAMETERS] + prior) @ of_errors)
+        taken += part * (inverted(of_motion + prior) @ of_errors)
     # What no motion takes up.
-    beside = products[:PARAMETERS, :PARAMETERS] @ taken - 2.0 * of_errors
-    left = np.trace(every[fitted:, fitted:]) + np.sum(taken * beside)
+    left = np.trace(every[fitted:, fitted:]) + np.sum(taken * (of_motion @ taken - 2.0 * of_errors))
     residual = math.sqrt(max(float(left), 0.0) / max(len(rows), 1))
     return CalibrationEffect(pull @ pull.T, residual, still)
 

@@ -49,7 +49,7 @@ _LEAST_ODDS = 4.0
 _ELSEWHERE = 2.0
 # Gates before a declared map, of two motions, differ by less, and a widened one from both by more.
 _WIDE = 1.2
-# A side of the image that has all but this part of a group.
+# A camera of a rig that has all but this part of a group.
 _ELSE = 0.1
 # Focal lengths, in parts of K's, from which another matrix is looked for: between two of them a
 # rough pose finds its points by another distance.
@@ -139,11 +139,10 @@ def left_out(
     if apart := _cameras_apart(observed, inliers, second, threshold):
         return LeftOut(Failure(Reason.MODEL_ERROR, apart))
     size = int(np.count_nonzero(second.chosen))
-    where = _side(observed, inliers, second.chosen)
     step = step_between(posterior.state, second.state)
     turn, move = float(np.linalg.norm(step[TURN])), float(np.linalg.norm(step[MOVE]))
     text = (
-        f"{found} points fit one motion, and {size} of the {left} left out {where}have a pose of "
+        f"{found} points fit one motion, and {size} of the {left} left out have a pose of "
         f"their own, {math.degrees(turn):.1f} deg and {move:.2g} m away"
     )
     faster = max(posterior.speeding - speeding(observed, second.state), 0.0)
@@ -399,18 +398,3 @@ def _by_chance(observed: Observed, posterior: Posterior, wide: bool) -> Failure 
         f"{found} points fit, and {near - found} others lie within {math.sqrt(circle):.0f} px of "
         "their places: so many fit by chance",
     )
-
-
-def _side(observed: Observed, inliers: BoolArray, group: BoolArray) -> str:
-    """Name the side of the image on which a group of points lies; empty if on none."""
-    if not observed.sighted.exposure.alone:
-        return ""
-    pixels = observed.sighted.pixels[observed.sighted.usable.indices]
-    for axis, names in enumerate((("left", "right"), ("top", "bottom"))):
-        low, high = np.quantile(pixels[group, axis], [_ELSE, 1.0 - _ELSE])
-        least, most = np.quantile(pixels[inliers, axis], [_ELSE, 1.0 - _ELSE])
-        if high < least:
-            return f"at the {names[0]} of the image "
-        if low > most:
-            return f"at the {names[1]} of the image "
-    return ""

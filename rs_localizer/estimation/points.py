@@ -477,52 +477,30 @@ def leaning_less(
     plane, centre, axis_of_plane = plane_of(points, inliers)
     if not plane:
         return False, state
-    seen, normal = state[9:12].copy(), np.zeros(3)
-    for i in range(3):
-        for k in range(3):
-            seen[i] += state[3 * i + k] * centre[k]
-            normal[i] += state[3 * i + k] * axis_of_plane[k]
-    sight = seen / np.sqrt(np.sum(seen * seen))
-    normal *= np.sign(np.sum(sight * normal))
-    axis = np.empty(3)
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        axis[i] = sight[j] * normal[k] - sight[k] * normal[j]
-    length = np.sqrt(np.sum(axis * axis))
-    lean = np.arcsin(min(length, 1.0))
+    rotation, away = state[:9].copy().reshape(3, 3), state[9:12].copy()
+    seen, normal = rotation @ centre + away, rotation @ axis_of_plane
+    sight = seen / math.sqrt(np.sum(seen * seen))
+    axis = so3.hat_of(sight) @ (np.sign(np.sum(sight * normal)) * normal)
+    length = math.sqrt(np.sum(axis * axis))
+    lean = math.asin(min(length, 1.0))
     if lean < _LEAST_LEAN:
         return False, state
     flip = so3.exp(-leans * lean / length * axis)
     other = state.copy()
-    for i in range(3):
-        other[9 + i] = seen[i]
-        for k in range(3):
-            other[9 + i] += flip[i, k] * (state[9 + k] - seen[k])
-            other[3 * i + k] = 0.0
-            for m in range(3):
-                other[3 * i + k] += flip[i, m] * state[3 * m + k]
+    other[:9], other[9:12] = (flip @ rotation).ravel(), seen + flip @ (away - seen)
     return True, other
 
 
 @entry
 def plane_of(points: Array2, inliers: BoolArray1) -> tuple[bool, Array, Array]:
     """Return True if the counted points lie on a plane, its centre (3,) and normal (3,)."""
-    centre, spread, count = np.zeros(3), np.zeros((3, 3)), 0
-    for i in range(len(points)):
-        if inliers[i]:
-            count += 1
-            for k in range(3):
-                centre[k] += points[i, k]
-    if count == 0:
+    chosen = points[inliers]
+    centre = np.zeros(3)
+    if len(chosen) == 0:
         return False, centre, centre
-    centre /= count
-    for i in range(len(points)):
-        if inliers[i]:
-            for j in range(3):
-                for k in range(j + 1):
-                    spread[j, k] += (points[i, j] - centre[j]) * (points[i, k] - centre[k])
-    for j in range(3):
-        for k in range(j):
-            spread[k, j] = spread[j, k]
+    for axis in range(3):
+        centre[axis] = np.mean(chosen[:, axis])
+    chosen -= centre
+    spread = chosen.T @ chosen
     extents, axes = np.linalg.eigh(spread)
     return extents[0] < _PLANE**2 * extents[1], centre, axes[:, 0].copy()

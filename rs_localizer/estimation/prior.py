@@ -22,7 +22,7 @@ from rs_localizer.core.arrays import Array, Array1, Array2, Array3, Out
 from rs_localizer.core.rig import Rig
 from rs_localizer.core.rotation_prior import ROTATION, RotationPrior
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.so3 import log
+from rs_localizer.core.so3 import hat_of, log
 from rs_localizer.core.state import (
     ACCELERATIONS,
     ANGULAR,
@@ -320,16 +320,13 @@ def pivot_of(covariance: Array2) -> Array:
     Who turns about it moves by its distance times the turn: that is the part of the move that goes
     with the turn. A camera that a measured position holds turns about itself.
     """
-    turned, along = np.zeros((3, 3)), np.zeros(3)
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        along[i] = covariance[j, 3 + k] - covariance[k, 3 + j]
-        for m in range(3):
-            turned[i, m] -= covariance[i, m]
-            turned[i, i] += (1.0 + _RIDGE) * covariance[m, m]
-    pivot = np.zeros(3)
+    pivot, block = np.zeros(3), covariance[:3, :3].copy()
     if np.all(np.isfinite(covariance[:6, :6])):
-        pivot = np.linalg.inv(turned) @ along
+        along, turned = covariance[:3, 3:6], (1.0 + _RIDGE) * np.trace(block) * np.eye(3) - block
+        vector = np.array([
+            along[1, 2] - along[2, 1], along[2, 0] - along[0, 2], along[0, 1] - along[1, 0]
+        ])  # fmt: skip
+        pivot = np.linalg.inv(turned) @ vector
     return pivot if np.all(np.isfinite(pivot)) else np.zeros(3)
 
 
@@ -364,63 +361,32 @@ def add_prior(
 
     These are of all 18 parameters, or of the first 12, while the accelerations are what they are.
     """
-    cost = 0.0
-    size = len(slope)
-    offset = np.empty(PARAMETERS)
-    pulled = np.empty(PARAMETERS)
-    by_turn = np.empty((6, 3))
+    cost, size = 0.0, len(slope)
     for term in range(len(terms.informations)):
-        prior, reference = terms.informations[term], terms.references[term]
-        posed = (
-            prior[0, 0] + prior[1, 1] + prior[2, 2] + prior[3, 3] + prior[4, 4] + prior[5, 5] > 0
-        )
-        first = 0 if posed else 6
-        for i in range(6):
-            offset[i] = 0.0
-        for i in range(6, PARAMETERS):
-            offset[i] = state[6 + i] - reference[6 + i]
+        reference, known = terms.references[term], terms.informations[term]
+        posed = np.any(np.diag(known)[:6] > 0.0)
         if posed:
-            _pose_offset(state, reference, terms.pivots[term], offset, by_turn)
+            offset, by_turn = offset_between(reference, state, terms.pivots[term])
+        else:  # without the logarithm of a rotation
+            offset, by_turn = np.zeros(PARAMETERS), np.zeros((6, 3))
+            offset[6:] = state[12:] - reference[12:]
+        pulled, first = np.zeros(PARAMETERS), 0 if posed else 6
         for i in range(first, PARAMETERS):
-            total = 0.0
             for j in range(first, PARAMETERS):
-                total += prior[i, j] * offset[j]
-            pulled[i] = weight * total
-            cost += offset[i] * pulled[i]
-        if not posed:
-            for i in range(6, size):
-                slope[i] += pulled[i]
-                for j in range(6, size):
-                    information[i, j] += weight * prior[i, j]
-            continue
-        _add_posed(prior, pulled, by_turn, weight, information, slope)
+                pulled[i] += known[i, j] * offset[j]
+            cost += weight * offset[i] * pulled[i]
+        if posed:  # J^T P J and J^T p: J is the identity but for the columns of the turn
+            known = known.copy()
+            known[:, :3] = known[:, :6].copy() @ by_turn
+            known[:3] = by_turn.T @ known[:6].copy()
+            pulled[:3] = by_turn.T @ pulled[:6]
+        for i in range(first, size):
+            slope[i] += weight * pulled[i]
+            for j in range(first, size):
+                information[i, j] += weight * known[i, j]
     if terms.gravity[6] > 0.0:
         cost += _add_gravity(terms.gravity, state, weight, information, slope)
     return cost
-
-
-@inlined
-def _add_posed(
-    prior: Array, pulled: Array, by_turn: Array, weight: float, information: Array, slope: Array
-) -> None:
-    """Add J^T P J and J^T p, where J is the identity but for the columns of the turn."""
-    size = len(slope)
-    half = prior.copy()  # P J
-    for i in range(size):
-        for j in range(3):
-            total = 0.0
-            for k in range(6):
-                total += prior[i, k] * by_turn[k, j]
-            half[i, j] = total
-    for i in range(3):
-        for k in range(6):
-            slope[i] += by_turn[k, i] * pulled[k]
-            for j in range(size):
-                information[i, j] += weight * by_turn[k, i] * half[k, j]
-    for i in range(3, size):
-        slope[i] += pulled[i]
-        for j in range(size):
-            information[i, j] += weight * half[i, j]
 
 
 @entry
@@ -434,50 +400,23 @@ def offset_between(reference: Array1, state: Array1, pivot: Array1) -> tuple[Arr
     a step's to first order. What an image says is nearly Gaussian in it, far along the arcs about
     the points, where a step's move leaves its tangent. By a move, it changes as the step does.
     """
-    offset, by_turn = np.empty(PARAMETERS), np.empty((6, 3))
-    _pose_offset(state, reference, pivot, offset, by_turn)
-    for i in range(6, PARAMETERS):
-        offset[i] = state[6 + i] - reference[6 + i]
-    return offset, by_turn
-
-
-@inlined
-def _pose_offset(
-    state: Array, reference: Array, pivot: Array, offset: Array, by_turn: Array
-) -> None:
-    """Fill in the first six numbers of :func:`offset_between`, and the derivative."""
-    relative, seen = np.empty((3, 3)), np.empty(3)  # reference from state: exp([turn]x); the pivot
-    for i in range(3):
-        for j in range(3):
-            total = 0.0
-            for k in range(3):
-                total += reference[3 * i + k] * state[3 * j + k]
-            relative[i, j] = total
+    before, after = reference[:9].copy().reshape(3, 3), state[:9].copy().reshape(3, 3)
+    relative = before @ after.T  # reference from state: exp([turn]x)
     turn = log(relative)
-    x, y, z = turn[0], turn[1], turn[2]
-    squared = x * x + y * y + z * z
-    angle = np.sqrt(squared)
+    seen = state[9:12] + relative.T @ (pivot - reference[9:12])
+    offset, by_turn = np.empty(PARAMETERS), np.empty((6, 3))
+    offset[:3], offset[6:] = turn, state[12:] - reference[12:]
+    about = hat_of(pivot)
+    offset[3:6] = about @ turn + pivot - seen
     # Inverse right Jacobian of the exponential; its second coefficient is 1/12 at zero.
-    if angle < 1e-3:
-        second = 1.0 / 12.0
-    else:
-        second = (1.0 - 0.5 * angle * np.sin(angle) / (1.0 - np.cos(angle))) / squared
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        by_turn[i, i] = 1.0 - second * (squared - turn[i] * turn[i])
-        by_turn[i, j] = -0.5 * turn[k] + second * turn[i] * turn[j]
-        by_turn[j, i] = 0.5 * turn[k] + second * turn[i] * turn[j]
-        seen[i] = state[9 + i]
-        for m in range(3):
-            seen[i] += relative[m, i] * (pivot[m] - reference[9 + m])
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        offset[i] = turn[i]
-        offset[3 + i] = pivot[j] * turn[k] - pivot[k] * turn[j] + pivot[i] - seen[i]
-        for m in range(3):
-            by_turn[3 + i, m] = pivot[j] * by_turn[k, m] - pivot[k] * by_turn[j, m]
-        by_turn[3 + i, k] -= seen[j]
-        by_turn[3 + i, j] += seen[k]
+    squared = np.sum(turn * turn)
+    angle, second = math.sqrt(squared), 1.0 / 12.0
+    if angle > 1e-3:
+        second = (1.0 - 0.5 * angle * math.sin(angle) / (1.0 - math.cos(angle))) / squared
+    crossed = hat_of(turn)
+    by_turn[:3] = np.eye(3) + 0.5 * crossed + second * (crossed @ crossed)
+    by_turn[3:] = about @ by_turn[:3] - hat_of(seen)
+    return offset, by_turn
 
 
 @inlined
@@ -486,25 +425,11 @@ def _add_gravity(
 ) -> float:
     """Add the cost of the measured direction: |R g - m|^2 times its precision."""
     precision = weight * gravity[6]
-    seen = np.empty(3)
-    for i in range(3):
-        total = 0.0
-        for j in range(3):
-            total += state[3 * i + j] * gravity[j]
-        seen[i] = total
-    # A turn phi of the camera moves the direction by seen x phi.
-    derivative = np.zeros((3, 3))
-    derivative[0, 1], derivative[0, 2] = -seen[2], seen[1]
-    derivative[1, 0], derivative[1, 2] = seen[2], -seen[0]
-    derivative[2, 0], derivative[2, 1] = -seen[1], seen[0]
-    cost = 0.0
-    for k in range(3):
-        error = seen[k] - gravity[3 + k]
-        cost += precision * error * error
-        for i in range(3):
-            slope[i] += precision * derivative[k, i] * error
-            for j in range(3):
-                information[i, j] += precision * derivative[k, i] * derivative[k, j]
+    seen = state[:9].copy().reshape(3, 3) @ gravity[:3]
+    error, derivative = seen - gravity[3:6], hat_of(seen)  # a turn phi moves it by seen x phi
+    slope[:3] += precision * (derivative.T @ error)
+    information[:3, :3] += precision * (derivative.T @ derivative)
+    cost: float = precision * np.sum(error * error)
     return cost
 
 

@@ -341,12 +341,9 @@ def decided(inverse: Array2, prior: PriorTerms, noise: float) -> float:
         inverse: (18,18) of the information of both, px^-2.
         noise: px, the one that the prior was weighed against.
     """
-    size = len(inverse)
-    total = float(size)
+    total = 1.0 * len(inverse)
     for term in range(len(prior.informations)):
-        for i in range(size):
-            for j in range(size):
-                total -= noise * noise * inverse[i, j] * prior.informations[term, i, j]
+        total -= noise * noise * np.sum(inverse * prior.informations[term])
     return max(total, 0.0)
 
 
@@ -356,9 +353,7 @@ def _least_eigenvalue(information: Array, inverse: Array) -> float:
 
     It is less by the number of parameters at most; 0 where there is no inverse.
     """
-    total = 0.0
-    for i in range(len(information)):
-        total += inverse[i, i] * information[i, i]
+    total = np.sum(np.diag(inverse) * np.diag(information))
     return 1.0 / total if total > 0.0 else 0.0
 
 
