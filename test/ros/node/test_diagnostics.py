@@ -104,27 +104,18 @@ def test_a_steady_camera_misses_nothing(rate, jitter):
         assert missing(stamps(rate, 150, jitter, np.random.default_rng(seed))) == 0
 
 
-class Log:
-    """Refusals with a clock that stands still, and the lines that they gave."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-        self.now = 100.0
-        self.refusals = Refusals(self.lines.append, clock=lambda: self.now)
-        self.add = self.refusals.add
-
-
-@pytest.fixture
-def log() -> Log:
-    return Log()
-
-
-def test_ever_new_details_fill_neither_log_nor_memory(log):
-    letters = "abcdefghijklmnopqrstuvwxyz"
-    for second in range(60):
-        for first in letters:
-            log.add("odd", f"field {first}{letters[second % 26]}{letters[second // 26]}")
-        log.now += 1.0
-    assert 12 <= len(log.lines) <= 12 * 9
-    assert sum(map(len, log.refusals._logged.values())) <= 9
-    assert log.refusals.counts == {"odd": 60 * 26}
+def test_a_reason_is_logged_once_in_five_seconds_and_always_counted():
+    lines, now = [], [100.0]
+    refusals = Refusals(lines.append, clock=lambda: now[0])
+    for second in range(12):
+        now[0] = 100.0 + second
+        refusals.add("odd", f"field {second}")
+        refusals.notice("other", "no refusal")
+    more = " (4 more since the last report)"
+    assert [line for line in lines if "odd" in line] == [
+        "odd: field 0", f"odd: field 5{more}", f"odd: field 10{more}"
+    ]  # fmt: skip
+    assert refusals.counts == {"odd": 12}
+    assert refusals.recent({"odd", "other", "never"}, 1.0) == {
+        "odd": "field 11", "other": "no refusal"
+    }  # fmt: skip
