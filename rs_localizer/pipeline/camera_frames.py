@@ -149,29 +149,35 @@ class CameraFrames(FrameLocalizer):
         self._expect(time_ns, cloud.frame)
         moment = published_moment(self._config, self._camera, cloud.stamp_ns)
 
+        tracker = self._tracker
+
         def localized(samples: Any) -> Estimate | Failure:
             nonlocal moment
-            matches, tracker = (cloud.points, cloud.pixels, cloud.scores), self._tracker
-            result = tracker.localize(time_ns, *matches, readings=samples, context=context)
-            moment = self._turned(moment, samples)
-            return result
+            matches = cloud.points, cloud.pixels, cloud.scores
+            found = tracker.localize(time_ns, *matches, readings=samples, context=context)
+            newest = tracker.newest
+            shown = moment.tau == within_rows(moment.tau) or tracker.repeats
+            if not shown and newest and newest.aided:  # the readings, and no row, show its motion
+                moment = moment._replace(motion=tracker.turned(moment.stamp_ns, samples))
+            return found
 
         self.aid.track(self._moment(time_ns), localized)
-        result = self._tracker.newest
+        result = tracker.newest
         assert result is not None
         if result:
-            ahead = (cloud.points[result.inliers] - result.position) @ result.rotation[2]
-            self._stream.pace(time_ns, result, float(np.median(ahead)), self._config)
+            self._stream.pace(time_ns, result, cloud.points, self._config)
             self._pose_prior.judge_result(result)
             if self.predicts:
                 self._newest = replace(cloud, table=cloud.table[:0], dropped=0)
-        if self._tracker.output_lag > 0:
+        if tracker.output_lag > 0:
             self._waiting[time_ns] = cloud, moment
-            while len(self._waiting) > self._tracker.output_lag + 1:
+            while len(self._waiting) > tracker.output_lag + 1:
                 del self._waiting[next(iter(self._waiting))]
-        self._report_shutter()
+        if (shutter := tracker.shutter).fault and shutter.kind not in self._faults:
+            self._faults.add(shutter.kind)
+            self._notice(Notice.READOUT_TIME, shutter.fault)
         published = self._published(cloud, result, moment)
-        if self._tracker.repeats and result:
+        if tracker.repeats and result:
             self._notice(
                 Notice.STILL_IMAGE,
                 "the pixels are those of the last image, bit for bit, and nothing says that the "
@@ -179,8 +185,9 @@ class CameraFrames(FrameLocalizer):
             )
         if not published:
             matches = cloud.points, cloud.pixels, what_fits.ids_of(cloud)
-            localizer = self._tracker.localizer
-            published = self._explained(published, lambda: what_fits.what_fits(localizer, *matches))
+            published = self._explained(
+                published, lambda: what_fits.what_fits(tracker.localizer, *matches)
+            )
         return published
 
     def _expect(self, time_ns: int, map_frame: str) -> None:
@@ -192,20 +199,6 @@ class CameraFrames(FrameLocalizer):
         prior = self._pose_prior.prior(self._moment(time_ns), map_frame)
         if prior is not None:
             self._tracker.expect(time_ns, prior)
-
-    def _report_shutter(self) -> None:
-        shutter = self._tracker.shutter
-        if shutter.fault and shutter.kind not in self._faults:
-            self._faults.add(shutter.kind)
-            self._notice(Notice.READOUT_TIME, shutter.fault)
-
-    def _turned(self, moment: PublishedMoment, samples: Any) -> PublishedMoment:
-        """Return the moment of the newest frame with its motion, if no row shows that."""
-        newest = self._tracker.newest
-        shown = moment.tau == within_rows(moment.tau) or self._tracker.repeats
-        if shown or not newest or not newest.aided:
-            return moment
-        return moment._replace(motion=self._tracker.turned(moment.stamp_ns, samples))
 
     def _published(
         self, cloud: Correspondences, result: Estimate | Failure, moment: PublishedMoment
@@ -224,13 +217,8 @@ class CameraFrames(FrameLocalizer):
             self._notice(Notice.DOUBTFUL, result.left_out)
         if self._tracker.lens.fault:
             self._notice(Notice.LENS, self._tracker.lens.fault)
-        return self._mounted_result(cloud, result, moment)
-
-    def _mounted_result(
-        self, cloud: Correspondences, estimate: Estimate, moment: PublishedMoment
-    ) -> Localized | Refusal:
         deviation = self._tracker.readout_time_deviation(self._context)
-        return self.mounted(self._camera_result(cloud, estimate, moment, deviation))
+        return self._result(cloud, result, moment, deviation)
 
     def _delayed(self, newest: Localized | Refusal, stamp_ns: int) -> Localized | Refusal | None:
         """Return the result that ``output_lag`` asks for, once the frame of this stamp has come.
@@ -281,4 +269,5 @@ class CameraFrames(FrameLocalizer):
         if found is None:
             return None
         cloud = replace(self._newest, stamp_ns=stamp_ns)
-        return self._mounted_result(cloud, found, PublishedMoment(stamp_ns, 0.0))
+        deviation = self._tracker.readout_time_deviation(self._context)
+        return self._result(cloud, found, PublishedMoment(stamp_ns, 0.0), deviation)

@@ -15,6 +15,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from rs_localizer.config import (
     CameraSettings,
     NodeConfig,
@@ -26,7 +28,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.camera_info import Calibration
-from rs_localizer.io.clouds import Correspondences, thinned
+from rs_localizer.io.clouds import Correspondences, select_inliers, thinned
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import CAMERA_INFO, MAP_POINTS
@@ -36,8 +38,8 @@ from rs_localizer.pipeline.aid import AidInput, without_aid, without_wait
 from rs_localizer.pipeline.cloud_checks import oddities
 from rs_localizer.pipeline.given_pose import GivenPose, PosePrior
 from rs_localizer.pipeline.keypoint_map import Landmarks, read_landmarks
-from rs_localizer.pipeline.pose_at_time import PublishedMoment
-from rs_localizer.pipeline.published import ReadoutKnown, of_body, of_camera
+from rs_localizer.pipeline.pose_at_time import PublishedMoment, pose_at, twist_at, with_timing
+from rs_localizer.pipeline.published import is_mounting_late, of_body
 from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
 from rs_localizer.pipeline.stream import Stream
 from rs_localizer.shutter_watch import ShutterWatch
@@ -225,6 +227,18 @@ class FrameLocalizer(ABC):
         """Return True if readings of this frame may come within this many seconds."""
         return False
 
+    def patience(self, stamp_ns: int) -> float:
+        """Return how long (s) a frame with this stamp waits for what may come yet; 0: not at all.
+
+        That are readings of its exposure, and the mounting at its last row.
+        """
+        config = self._config
+        if self.awaits_readings(stamp_ns, config.imu.wait):
+            return config.imu.wait
+        last_ns = stamp_ns + round(1e9 * (config.stamp_offset + config.readout_time))
+        late = is_mounting_late(self.transforms, self.camera_frame, config.base_frame, last_ns)
+        return config.transform_tolerance if late else 0.0
+
     def load_files(self) -> None:
         """Use ``camera_file`` and the maps ``map_file`` and ``marker_map`` of the settings, if any.
 
@@ -253,14 +267,44 @@ class FrameLocalizer(ABC):
         if not given.lasts:
             self._forget_motion()
 
-    def _camera_result(
+    def _result(
         self, cloud: Correspondences, estimate: Estimate, moment: PublishedMoment,
-        readout_deviation: float = 0.0,
-    ) -> Localized:  # fmt: skip
-        """Return the pose and twist of the first camera at a moment, as of :func:`.of_camera`."""
-        first = next(iter(self._cameras.values())).first_row_time
-        readout = ReadoutKnown(readout_deviation, first, self.shutter.is_global)
-        return of_camera(cloud, estimate, self._config, self.camera_frame, moment, readout)
+        deviation: float = 0.0,
+    ) -> Localized | Refusal:  # fmt: skip
+        """Return pose and twist of ``base_frame`` at a moment.
+
+        Args:
+            cloud: with the rows of the estimate, or with none.
+            estimate: of the first camera.
+            moment: for which they are valid.
+            deviation: s, of the readout time.
+        """
+        config, readout_time, (stamp_ns, tau, there) = self._config, estimate.span, moment
+        moving = readout_time > 0.0 and find_solver(config.solver).rolling_shutter
+        if self.shutter.is_global and not estimate.aided:
+            moving = False  # an image says nothing of velocities
+        motion, at = (estimate, tau) if there is None else (there, 0.0)
+        pose = pose_at(motion, at)
+        twist = twist_at(motion, at, readout_time) if moving else None
+        if twist is not None and deviation > 0.0:
+            # The middle row comes later where the readout takes longer; the first one does not.
+            first = next(iter(self._cameras.values())).first_row_time
+            delay, share = deviation * first * (tau == 0.0), deviation / readout_time
+            pose, twist = with_timing(pose, twist, share, delay, config.acceleration)
+        seen = np.asarray(estimate.inliers) if len(cloud.table) else np.zeros(0, np.bool_)
+        return self.mounted(
+            Localized(
+                input_stamp_ns=cloud.stamp_ns,
+                stamp_ns=stamp_ns,
+                map_frame=cloud.frame,
+                body_frame=self.camera_frame,
+                pose=pose,
+                twist=twist,
+                inliers=select_inliers(cloud.table, seen, np.asarray(estimate.residuals)),
+                dropped=cloud.dropped,
+                estimate=estimate,
+            )
+        )
 
     def mounted(self, localized: Localized) -> Localized | Refusal:
         """Return the result of ``base_frame`` from the result of the camera."""

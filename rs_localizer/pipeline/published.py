@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Published frames: the moment, the velocities, and the transform to ``base_frame``.
+"""Published frames: their mounting on ``base_frame``, and transforms for TF.
 
 ``R = map_from_camera`` and ``p`` are the camera's pose, ``v, w`` its velocities in its own axes.
 The mount ``camera_from_base`` has the rotation ``C`` and the translation ``r``, the base's origin
@@ -24,15 +24,11 @@ from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.reasons import Reason
-from rs_localizer.core.types import Estimate
-from rs_localizer.io.clouds import Correspondences, select_inliers
 from rs_localizer.io.outputs import BodyPose, Localized, Twist
 from rs_localizer.io.transforms import NotYetError, Transform, TransformError, Transforms
 from rs_localizer.pipeline.carried_pose import FoundPose, Odometry
 from rs_localizer.pipeline.map_to_odom import CorrectionState, Settings, decide
-from rs_localizer.pipeline.pose_at_time import PublishedMoment, pose_at, twist_at, with_timing
-from rs_localizer.pipeline.refusal import Refusal, Waiting
-from rs_localizer.solvers.table import find_solver
+from rs_localizer.pipeline.refusal import Refusal
 
 _LINEAR, _ANGULAR = slice(0, 3), slice(3, 6)
 
@@ -107,56 +103,6 @@ def _propagate(jacobian: Array, covariance: Array) -> Array:
     return 0.5 * (result + result.T)  # rounding must not cost the symmetry
 
 
-@dataclass(frozen=True, slots=True)
-class ReadoutKnown:
-    """Knowledge of the readout time; by default, as it is set."""
-
-    deviation: float = 0.0  # s
-    first_row_time: float = 0.0  # from the middle row, in readout times
-    global_shutter: bool = False  # all rows are exposed at once, whatever is set
-
-
-def of_camera(
-    cloud: Correspondences,
-    estimate: Estimate,
-    config: NodeConfig,
-    frame: str,
-    moment: PublishedMoment,
-    readout: ReadoutKnown,
-) -> Localized:
-    """Return pose and twist of the optical frame of the (first) camera at a moment.
-
-    Args:
-        cloud: with the rows of the estimate, or with none.
-    """
-    readout_time = estimate.span
-    stamp_ns, tau, there = moment
-    moving = readout_time > 0.0 and find_solver(config.solver).rolling_shutter
-    if readout.global_shutter and not estimate.aided:
-        moving = False  # an image says nothing of velocities
-    motion, at = (estimate, tau) if there is None else (there, 0.0)
-    pose = pose_at(motion, at)
-    twist = twist_at(motion, at, readout_time) if moving else None
-    deviation = readout.deviation
-    if twist is not None and deviation > 0.0:
-        # The middle row comes later where the readout takes longer; the first one does not.
-        delay = deviation * readout.first_row_time if tau == 0.0 else 0.0
-        share = deviation / readout_time
-        pose, twist = with_timing(pose, twist, share, delay, config.acceleration)
-    seen = np.asarray(estimate.inliers) if len(cloud.table) else np.zeros(0, np.bool_)
-    return Localized(
-        input_stamp_ns=cloud.stamp_ns,
-        stamp_ns=stamp_ns,
-        map_frame=cloud.frame,
-        body_frame=frame,
-        pose=pose,
-        twist=twist,
-        inliers=select_inliers(cloud.table, seen, np.asarray(estimate.residuals)),
-        dropped=cloud.dropped,
-        estimate=estimate,
-    )
-
-
 def of_body(
     localized: Localized, config: NodeConfig, transforms: Transforms
 ) -> Localized | Refusal:
@@ -172,18 +118,24 @@ def of_body(
         mounting = find_mounting(transforms, localized.body_frame, base, stamp_ns, span_ns)
     except TransformError as error:
         text = f"from the camera {localized.body_frame!r} to base_frame {base!r}: {error}"
-        if not isinstance(error, NotYetError):
-            return Refusal(Reason.NO_TRANSFORM, text)
-        patience = config.transform_tolerance
-        return Waiting(
-            Reason.NO_TRANSFORM, text, lambda: of_body(localized, config, transforms), patience
-        )
+        return Refusal(Reason.NO_TRANSFORM, text)
     return replace(
         localized,
         body_frame=base,
         pose=base_pose(localized.pose, mounting),
         twist=base_twist(localized.twist, mounting) if localized.twist else None,
     )
+
+
+def is_mounting_late(transforms: Transforms, camera: str, base: str, time_ns: int) -> bool:
+    """Return True if the mount is known for earlier times only."""
+    if "" in (camera, base) or base == camera:
+        return False
+    try:
+        transforms.lookup(camera, base, time_ns)
+    except TransformError as error:
+        return isinstance(error, NotYetError)
+    return False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,17 +24,6 @@ class Refusal:
         return False
 
 
-@dataclass(frozen=True, slots=True)
-class Waiting(Refusal):
-    """A localized frame whose mounting is known for earlier times only.
-
-    It is refused, unless somebody asks for it again.
-    """
-
-    again: Callable[[], Any]  # the result or another refusal
-    patience: float  # s, for which this makes sense
-
-
 Notify = Callable[[Notice | ImuReason, str], None]
 """Told of what is odd, with one sentence. Frames are localized all the same."""
 

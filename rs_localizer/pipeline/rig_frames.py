@@ -328,7 +328,7 @@ class RigFrames(FrameLocalizer):
             )
         assert isinstance(result, RigEstimate)
         self._landmarks.lacking = False  # who sends correspondences needs none
-        return self.mounted(self._localized(images, result, origin_ns))
+        return self._localized(images, result, origin_ns)
 
     def _mount(self, images: Sequence[CameraImage]) -> Refusal | None:
         """Look up where cameras are that move; why one of this frame is not known."""
@@ -354,12 +354,13 @@ class RigFrames(FrameLocalizer):
 
     def _localized(
         self, images: Sequence[CameraImage], result: RigEstimate, origin_ns: int
-    ) -> Localized:
-        """Return the pose and twist of the rig's axes at the published moment."""
+    ) -> Localized | Refusal:
+        """Return the pose and twist of the body at the published moment."""
         config, first = self._config, images[0].cloud
         time_ns = origin_ns + round(1e9 * result.time)
         stamp_ns = time_ns if config.pose_time == PoseTime.MID_FRAME else first.stamp_ns
         tau = (stamp_ns - time_ns) / (1e9 * result.span)  # exact for a camera alone
         moment = PublishedMoment(stamp_ns, tau)
-        made = self._camera_result(joined(config.cameras, images), result, moment)
-        return replace(made, cameras=tuple(share_of(image, result) for image in images))
+        made = self._result(joined(config.cameras, images), result, moment)
+        shares = tuple(share_of(image, result) for image in images)
+        return replace(made, cameras=shares) if made else made

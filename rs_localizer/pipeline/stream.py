@@ -82,13 +82,13 @@ class Stream:
             self._notice(name, f"{text}; the previous frames are forgotten")
         return None
 
-    def pace(self, time_ns: int, estimate: Estimate, depth: float, config: NodeConfig) -> None:
+    def pace(self, time_ns: int, estimate: Estimate, points: Array, config: NodeConfig) -> None:
         """Look whether poses run faster than any camera does.
 
         Args:
             time_ns: of the frame.
             estimate: its pose.
-            depth: m from the camera to the points of the map, median.
+            points: (n,3) of the frame.
             config: settings.
         """
         places = self._places
@@ -102,6 +102,8 @@ class Stream:
             return
         speed = _speed(places)
         if speed > _TOO_FAST * prior:
+            ahead = (points[estimate.inliers] - estimate.position) @ estimate.rotation[2]
+            depth = float(np.median(ahead))
             self._notice(
                 Notice.MAP_SCALE,
                 f"by its poses the camera moves at {speed:.0f} m/s, {depth:.0f} m from the points, "

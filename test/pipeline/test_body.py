@@ -24,9 +24,10 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.outputs import Localized, messages
-from rs_localizer.io.transforms import TransformError, TransformTree
+from rs_localizer.io.transforms import NotYetError, TransformError, TransformTree
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.camera_frames import CameraFrames
+from rs_localizer.pipeline.frames import ANY_CALIBRATION
 from rs_localizer.pipeline.map_to_odom import CorrectionState
 from rs_localizer.pipeline.published import Broadcast, broadcast
 from rs_localizer.pipeline.refusal import Refusal
@@ -306,6 +307,20 @@ def test_a_camera_on_a_moving_head(localize, robot, pose_time):
     assert isinstance(refused, Refusal)
     assert refused.reason == "no_transform"
     assert "'mast' is known from 4.975 s to 5.145 s, not at 5.155 s" in refused.detail
+
+
+def test_a_frame_waits_for_the_mounting_at_its_last_row():
+    class Live(TransformTree):
+        """Knows what a head that moves did until 5 s."""
+
+        def lookup(self, target: str, source: str, stamp_ns: int | None) -> Any:
+            raise (NotYetError if stamp_ns > STAMP_NS else TransformError)(source)
+
+    frames = CameraFrames(NodeConfig(readout_time=0.03, base_frame="base_link"), transforms=Live())
+    assert frames.patience(STAMP_NS - 29_000_000) == 0.0  # no camera_info has come
+    frames.calibrate(ANY_CALIBRATION)
+    assert frames.patience(STAMP_NS - 31_000_000) == 0.0
+    assert frames.patience(STAMP_NS - 29_000_000) == frames.config.transform_tolerance
 
 
 def test_a_missing_transform_refuses_the_frame_only(localize):

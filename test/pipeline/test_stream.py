@@ -76,8 +76,11 @@ def test_a_map_in_millimetres_is_named(unit, speed, noise, told, to_and_fro):
         way = speed * np.sin(2.0 * np.pi * i / 30.0) / 4.0 if to_and_fro else speed * i / 30.0
         place = np.array([way, 0.0, 2.0]) + rng.normal(0.0, noise, 3)
         covariance = np.diag(np.full(12, (unit * noise) ** 2))
-        estimate: Any = SimpleNamespace(position=unit * place, covariance=covariance)
-        heard.stream.pace(i * SECOND // 30, estimate, unit * 2.0, NodeConfig())
+        estimate: Any = SimpleNamespace(
+            position=unit * place, rotation=np.eye(3), covariance=covariance, inliers=[0, 1, 2]
+        )
+        points = estimate.position + unit * 2.0 * np.eye(3)[[2, 2, 2]]
+        heard.stream.pace(i * SECOND // 30, estimate, points, NodeConfig())
     assert ("map_scale" in heard.notices) == told
     if told:
         speeds = [float(text.split(" m/s")[0].split()[-1]) for text in heard.texts]
@@ -94,5 +97,5 @@ def test_what_happened_while_nothing_was_seen_is_no_speed():
     heard, covariance = Heard(), np.diag(np.full(12, 1e-4))
     for i in range(6):
         estimate: Any = SimpleNamespace(position=np.full(3, 1e3 * i), covariance=covariance)
-        heard.stream.pace(round(0.6 * i * SECOND), estimate, 2.0, NodeConfig())
+        heard.stream.pace(round(0.6 * i * SECOND), estimate, np.zeros((0, 3)), NodeConfig())
     assert heard.notices == []

@@ -172,7 +172,10 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         def localize(topic: str, message: Any) -> Results:
             return named[topic].take_message(frames, message)
 
-        self.employ(localize, self._publisher.publish, functools.partial(_patience, frames))
+        def patience(message: Any) -> float:
+            return frames.patience(stamp_ns(message))
+
+        self.employ(localize, self._publisher.publish, patience)
 
     def _drop(self) -> None:
         self._frames = self._publisher = None
@@ -338,12 +341,6 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         )
         health = diagnose(condition, self.statistics.summary())
         return health, "" if frames is None else frames.camera_frame
-
-
-def _patience(frames: FrameLocalizer, message: Any) -> float:
-    """Return how long (s) a frame waits for the IMU's readings of its exposure."""
-    wait = frames.config.imu.wait
-    return wait if frames.awaits_readings(stamp_ns(message), wait) else 0.0
 
 
 def described(landmarks: Map) -> str:

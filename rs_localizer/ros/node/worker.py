@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from rs_localizer.core.reasons import Reason
-from rs_localizer.pipeline.refusal import Refusal, Waiting
+from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.node.refusals import describe
 from rs_localizer.ros.node.statistics import Statistics
 
@@ -25,9 +25,9 @@ they come.
 """
 
 _NAME = "rs_localizer worker"
-# Interval (s) at which waiting frames and results are looked at, and how many may wait.
-_LATE_PERIOD = 0.005
-_MOST_LATE = 100
+# Interval (s) at which waiting frames are looked at, and how many may wait.
+_LOOK_PERIOD = 0.005
+_MOST_WAITING = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +71,7 @@ class Worker(Generic[Result]):
         self._frames: dict[str, _Arrival] = {}
         self._session = 0
         self._closed = self._woken = False
-        # The thread's: frames that wait for what they need; results that do, until a time.
-        self._early: deque[_Arrival] = deque()
-        self._late: deque[tuple[_Arrival, Waiting, float]] = deque()
+        self._waiting: deque[_Arrival] = deque()  # the thread's: frames that lack something
         # Held while publishing: after pause() nothing comes any more.
         self._publishing = threading.Lock()
         threading.Thread(target=self._run, name=_NAME, daemon=True).start()
@@ -104,7 +102,7 @@ class Worker(Generic[Result]):
 
     def look(self) -> None:
         """Look again at waiting frames: something has come."""
-        if self._early:
+        if self._waiting:
             with self._changed:
                 self._woken = True
                 self._changed.notify()
@@ -127,14 +125,12 @@ class Worker(Generic[Result]):
 
     def _run(self) -> None:
         while self._take():
-            self._finish_late()
             if self._is_ready():
-                self._begin(self._early.popleft())
+                self._begin(self._waiting.popleft())
 
     def _take(self) -> bool:
         """Wait for something to do, apply updates and take a frame; False at the end."""
-        waits = self._late or self._early
-        timeout = 0.0 if self._is_ready() else _LATE_PERIOD if waits else None
+        timeout = 0.0 if self._is_ready() else _LOOK_PERIOD if self._waiting else None
         with self._changed:
             self._changed.wait_for(
                 lambda: self._updates or self._frames or self._closed or self._woken, timeout
@@ -142,7 +138,7 @@ class Worker(Generic[Result]):
             self._woken = False
             updates, self._updates = self._updates, {}
             if oldest := next(iter(self._frames), None):
-                self._early.append(self._frames.pop(oldest))
+                self._waiting.append(self._frames.pop(oldest))
         for update in updates.values():
             if isinstance(failure := self._attempt(update), Refusal):
                 self._failed(failure.detail)
@@ -150,9 +146,9 @@ class Worker(Generic[Result]):
 
     def _is_ready(self) -> bool:
         """Return True if there is a frame that need not wait."""
-        if not self._early or len(self._early) > _MOST_LATE:
-            return bool(self._early)
-        frame = self._early[0]
+        if not self._waiting or len(self._waiting) > _MOST_WAITING:
+            return bool(self._waiting)
+        frame = self._waiting[0]
         patience = self._attempt(lambda: self._patience(frame.message)) or 0.0
         return time.monotonic() >= frame.received + patience
 
@@ -168,22 +164,8 @@ class Worker(Generic[Result]):
         result = self._attempt(lambda: self._work(frame.topic, frame.message))
         several = result if isinstance(result, Iterator) else iter([result])
         while (each := self._attempt(lambda: next(several, None))) is not None:
-            if isinstance(each, Waiting) and len(self._late) < _MOST_LATE:
-                self._late.append((frame, each, time.monotonic() + each.patience))
-            else:
-                self._finish(frame, each)
+            self._finish(frame, each)
         self._statistics.ended()
-
-    def _finish_late(self) -> None:
-        """Publish results that are ready, in the order of their arrival; give up overdue ones."""
-        while self._late:
-            frame, waiting, deadline = self._late[0]
-            result = self._attempt(waiting.again)
-            patient = time.monotonic() < deadline and self._is_wanted(frame)
-            if isinstance(result, Waiting) and patient:
-                return
-            self._late.popleft()
-            self._finish(frame, result)
 
     def _attempt(self, function: Callable[[], Any]) -> Any:
         """Return the function's value, or a refusal if it fails."""

@@ -11,7 +11,7 @@ import pytest
 from sensor_msgs.msg import Image
 
 from rs_localizer.core.reasons import Reason
-from rs_localizer.pipeline.refusal import Refusal, Waiting
+from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.node import worker as worker_module
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import Statistics
@@ -48,9 +48,7 @@ class Fake:
         self.go_on = threading.Semaphore(0)
         self.published: list[str] = []
         self.done = threading.Semaphore(0)
-        self.mounted: set[str] = set()
         self.awaited: set[str] = set()
-        self.patience = PATIENCE
         self.while_publishing: Callable[[], Any] = lambda: None
         self.refusals = Refusals(lambda text: None)
         self.statistics = Count(self.refusals, lambda text: (0, text))
@@ -73,15 +71,7 @@ class Fake:
         before = self.settings
         assert self.go_on.acquire(timeout=PATIENCE)
         assert self.settings == before
-        if frame.startswith("late"):
-            return self._waiting(frame)
         return f"{frame} {self.settings}"
-
-    def _waiting(self, frame: str) -> Any:
-        def again() -> Any:
-            return frame if frame in self.mounted else self._waiting(frame)
-
-        return Waiting("no_transform", "not yet", again, self.patience)
 
     def _publish(self, frame: Any) -> None:
         self.while_publishing()
@@ -217,14 +207,14 @@ def test_all_results_of_a_message_are_published_as_they_come(fake):
 
 
 def test_what_a_frame_waited_for_wakes_the_worker(monkeypatch, fake):
-    monkeypatch.setattr(worker_module, "_LATE_PERIOD", PATIENCE)  # it does not look by itself
+    monkeypatch.setattr(worker_module, "_LOOK_PERIOD", PATIENCE)  # it does not look by itself
     fake.go_on.release()
     fake.awaited = {"one"}
     fake.send("one")
     changed = threading.Semaphore(0)
     fake.worker.update("settings", changed.release)
     fake.wait(changed)
-    while not fake.worker._early:
+    while not fake.worker._waiting:
         time.sleep(0.001)
     fake.awaited.clear()
     fake.worker.look()
@@ -258,23 +248,6 @@ def test_what_an_update_of_nobody_foresaw_is_told_and_the_next_is_done():
     assert wait_for_workers(PATIENCE)
     assert len(told) == 1
     assert "a bug" in told[0]
-
-
-def test_a_late_mounting_keeps_no_other_frame_waiting(fake):
-    fake.go_on.release(4)
-    for frame in ("late 1", "late 2", "next"):
-        fake.send(frame)
-        fake.wait(fake.started)
-    fake.wait(fake.done)
-    assert fake.published == ["next old"]
-    fake.mounted = {"late 2"}  # later ones wait for the first
-    time.sleep(0.05)
-    assert fake.published == ["next old"]
-    fake.mounted = {"late 1", "late 2"}
-    fake.wait(fake.done)
-    fake.wait(fake.done)
-    assert fake.published == ["next old", "late 1", "late 2"]
-    assert fake.statistics.summary().total["refused"] == 0
 
 
 def test_a_frame_waits_for_what_it_needs_but_not_for_long(fake):
