@@ -75,8 +75,8 @@ class Reason(_Explained):
     BAD_MAP = "bad_map", "map_points cannot be used", "fields x y z, and id or descriptor"
     BAD_IMU = "bad_imu", "imu cannot be used", "rad/s and m/s^2, filled in by its driver?"
     BAD_DETECTIONS = (
-        "bad_detections", "detections cannot be used, or their order of corners",
-        "apriltag's order: lower left, lower right, upper right, upper left",
+        "bad_detections", "detections cannot be used",
+        "ids and four corners in pixels",
     )
     NO_MAP = (
         "no_map", "keypoints without a map, detections without marker_map",

@@ -12,25 +12,10 @@ from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.detections import TagDetections, read_detections
-from rs_localizer.markers.boards import flat_misfit
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse
 
-# The order of corners is held against the map until this many images of two or more tags agree,
-# then in one image of this many.
-_AGREED, _ONE_IN = 20, 30
-# Other orders in which our four corners may be given.
-_ORDERS = [
-    [(first + step * k) % 4 for k in range(4)]
-    for step in (1, -1)
-    for first in range(4)
-    if (first, step) != (0, 1)
-]
-# Distance of corners from their places by a homography, in sides: in the right order (also of a
-# fisheye lens, of two neighbours), and in a wrong one.
-_FITS, _MISFITS = 0.1, 0.25
-_CORNERS = ("upper left", "upper right", "lower right", "lower left")  # ours
 _SHOWN = 8  # names in a sentence
 
 
@@ -51,7 +36,6 @@ class Tags:
             m.family.kind.replace("apriltag_", "tag"): m.family.kind for m in marker_map.markers
         }
         self.corners = np.array([marker.corners for marker in marker_map.markers])  # (n,4,3)
-        self._agreed = self._images = 0
 
     def match(self, message: Any) -> Correspondences | Refusal:
         """Match an AprilTagDetectionArray with the map; a bad one is refused, never raised."""
@@ -65,9 +49,6 @@ class Tags:
             names = _listed(detections, np.arange(len(rows)))
             return Refusal(Reason.NO_MATCHES, f"the marker map has none of {names}")
         detections = replace(detections, ids=rows[rows >= 0], corners=detections.corners[rows >= 0])
-        order = self._other_order(detections)
-        if order is not None:
-            return Refusal(Reason.BAD_DETECTIONS, order)
         return self._correspondences(detections)
 
     def _known(self, detections: TagDetections) -> IntArray:
@@ -87,35 +68,6 @@ class Tags:
                 self._notice(name, f"the detector has found {listed}, {text}")
         rows[repeated] = -1
         return rows
-
-    def _other_order(self, detections: TagDetections) -> str | None:
-        """Describe the fault of the corners' order, if another one fits the map."""
-        self._images += 1
-        if len(detections.ids) < 2 or (self._agreed >= _AGREED and self._images % _ONE_IN):
-            return None
-        pair = self._neighbours(detections)
-        points = self._points[(detections.ids[pair, None] + np.arange(4)).ravel()]
-        corners = detections.corners[pair]
-        misfit = flat_misfit(points, corners.reshape(-1, 2))
-        if not misfit > _MISFITS:  # NaN, of two planes, says nothing
-            self._agreed += 1
-            return None
-        for order in _ORDERS:
-            if flat_misfit(points, corners[:, order].reshape(-1, 2)) < _FITS:
-                # A message has ours backwards.
-                names = [_CORNERS[order.index(k)] for k in (3, 2, 1, 0)]
-                return (
-                    f"the map fits corners in the order {', '.join(names)}; apriltag's is "
-                    f"{', '.join(_CORNERS[::-1])}"
-                )
-        return None
-
-    def _neighbours(self, detections: TagDetections) -> IntArray:
-        """Return the two tags (2,) whose middles are nearest to each other in the map."""
-        middles = self._points[detections.ids[:, None] + np.arange(4)].mean(axis=1)
-        apart = np.linalg.norm(middles[:, None] - middles, axis=2)
-        np.fill_diagonal(apart, np.inf)
-        return np.array(np.unravel_index(np.argmin(apart), apart.shape))
 
     def _correspondences(self, detections: TagDetections) -> Correspondences:
         sides = np.linalg.norm(np.roll(detections.corners, -1, axis=1) - detections.corners, axis=2)

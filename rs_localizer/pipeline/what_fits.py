@@ -9,6 +9,7 @@ found; residuals alone do not show it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -55,16 +56,26 @@ def _exchanged(frame: _Frame) -> Array | None:
     return frame.pixels[:, ::-1]
 
 
-def _half_turned(frame: _Frame) -> Array | None:
-    """Give each corner the pixel of the opposite one; None if there are no such ids."""
+def _reordered(order: tuple[int, ...], frame: _Frame) -> Array | None:
+    """Give each corner the pixel of its marker's corner in this order; None without such ids."""
     if frame.ids is None:
         return None
     place = {id_: row for row, id_ in enumerate(frame.ids.tolist())}
-    opposite = [place.get(id_ ^ 2, -1) for id_ in frame.ids.tolist()]
-    whole = np.array(opposite) >= 0
-    return np.where(whole[:, None], frame.pixels[opposite], np.nan) if whole.any() else None
+    others = [place.get(id_ - id_ % 4 + order[id_ % 4], -1) for id_ in frame.ids.tolist()]
+    whole = np.array(others) >= 0
+    return np.where(whole[:, None], frame.pixels[others], np.nan) if whole.any() else None
 
 
+# The other orders in which four corners may be given; ours.
+_ORDERS = [
+    tuple((first + step * k) % 4 for k in range(4))
+    for step in (1, -1)
+    for first in range(4)
+    if (first, step) != (0, 1)
+]
+_CORNERS = ("upper left", "upper right", "lower right", "lower left")
+# The mistakes of a plane that do not show: mirrored, it is seen from behind.
+_OF_IMAGES = (_left_right, _upside_down, _exchanged)
 # Corrections by name, and the functions that apply them.
 _MISTAKES: dict[str, Callable[[_Frame], Array | None]] = {
     "pixels are mirrored left to right: the sender mirrors them (or the map is left-handed)":
@@ -72,8 +83,11 @@ _MISTAKES: dict[str, Callable[[_Frame], Array | None]] = {
     "pixels are mirrored top to bottom: the sender flips them (or the map is left-handed)":
         _upside_down,
     "u and v are exchanged: u counts columns, v rows": _exchanged,
-    "corners of markers are turned by half: their order begins at the opposite corner":
-        _half_turned,
+} | {
+    "corners of markers come in another order: where "
+    f"{', '.join(_CORNERS)} belong, {', '.join(_CORNERS[order.index(k)] for k in range(4))} stand":
+        partial(_reordered, order)
+    for order in _ORDERS
 }  # fmt: skip
 # The two differ by a half turn of the camera and the direction of the shutter, which one image
 # hardly shows: a reversed motion looks alike.
@@ -98,7 +112,7 @@ def what_fits(
     flat = _is_flat(points)
     fits: dict[str, tuple[int, float]] = {}
     for mistake, undone in _MISTAKES.items():
-        if (flat and undone is not _half_turned) or (changed := undone(frame)) is None:
+        if (flat and undone in _OF_IMAGES) or (changed := undone(frame)) is None:
             continue
         usable = np.isfinite(changed).all(axis=1)
         found = localizer.localize(points[usable], changed[usable])

@@ -61,7 +61,10 @@ MISTAKES = {
     "left to right": lambda pixels: pixels * [-1.0, 1.0] + [639.0, 0.0],
     "top to bottom": lambda pixels: pixels * [1.0, -1.0] + [0.0, 479.0],
     "exchanged": lambda pixels: pixels[:, ::-1],
-    "turned by half": opposite,
+    "lower right, lower left, upper left, upper right stand": opposite,
+    "upper right, upper left, lower left, lower right stand": lambda pixels: pixels.reshape(
+        -1, 4, 2
+    )[:, [1, 0, 3, 2]].reshape(-1, 2),
 }
 
 
