@@ -25,7 +25,6 @@ from rs_localizer.settings import (
     NODES,
     Kind,
     SettingsError,
-    build,
     load_params_file,
     settings,
 )
@@ -127,27 +126,16 @@ def _file_of(kind: Kind) -> str:
 
 
 def given(texts: Texts, kind: Kind = NodeConfig) -> dict[str, Any]:
-    """Return the settings of a node among the launch arguments.
-
-    Raises:
-        ValueError: for a value that the node would refuse: the launch fails at once.
-    """
-    values = {
+    """Return the settings of a node among the launch arguments; it refuses wrong ones itself."""
+    return {
         name: _read(texts[name], setting.default)
         for name, setting in settings(kind).items()
         if texts.get(name)
     }
-    build({**values, **_of_rig(values)}, kind)
-    return values
-
-
-def _of_rig(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the cameras of a rig, whose readout times may be in the params file."""
-    return {"readout_time": 0.01} if "cameras" in values and "readout_time" not in values else {}
 
 
 def _read(text: str, default: Any) -> Any:
-    """Read the value of a text; a text of another type stays, and is refused later."""
+    """Read the value of a text; a text of another type stays, and the node refuses it."""
     if isinstance(default, str):
         return text
     if default == NO_NAMES:
@@ -174,7 +162,7 @@ def node(
         options: of launch_ros' Node.
 
     Raises:
-        ValueError: for settings that the node would refuse, or a params file that is not there.
+        ValueError: for a params file that is not there.
     """
     file = texts[_file_of(kind)]
     if not Path(file).expanduser().is_file():

@@ -222,17 +222,6 @@ def test_what_a_frame_waited_for_wakes_the_worker(monkeypatch, fake):
     assert fake.published == ["one old"]
 
 
-def test_all_that_wakes_the_worker_does_so_at_once(fake):
-    """An update without a frame, and a frame without an update."""
-    changed = threading.Semaphore(0)
-    for _ in range(3):
-        fake.worker.update("settings", changed.release)
-        fake.wait(changed)
-    fake.go_on.release()
-    fake.send("one")
-    fake.wait(fake.done)
-
-
 def test_what_an_update_of_nobody_foresaw_is_told_and_the_next_is_done():
     told: list[str] = []
     done = threading.Semaphore(0)
