@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.tools.mapping import MappingError
@@ -41,7 +41,6 @@ from rs_localizer.tools.mapping.refinement import DRIFT, RefinedMap
 from rs_localizer.tools.mapping.seen_images import (
     LEAST_VIEWS,
     SeenImage,
-    blurred,
     check_views,
     choose_keyframes,
 )
@@ -129,7 +128,6 @@ class Built:
     camera: Camera  # with its lens, readout time and scan direction, as they were found
     placement: Placement
     keyframes: IntArray  # rows of the views that COLMAP got
-    blurred: BoolArray  # of the views
     structure: Structure  # as COLMAP had it, moved into this frame as a whole
     kept: IntArray  # (l,) rows of the structure's points that are landmarks
     shutter: ShutterFit | None  # None: it was given, and the images do not contradict it
@@ -210,7 +208,6 @@ def built_from(
         camera=refined.camera_as_found,
         placement=place,
         keyframes=structure.views,
-        blurred=blurred(inputs.views),
         structure=replace(structure, start=structure.start.moved(similarity)),
         kept=kept,
         shutter=shutter,

@@ -37,7 +37,7 @@ def rows(built: Built, images: int, views: int) -> list[tuple[str, str]]:
     joined = f"{structure.parts[0]} of {len(built.keyframes)}"
     others = structure.parts[1:]
     return [
-        ("images", f"{images}, {views} used, {np.count_nonzero(built.blurred)} of them blurred"),
+        ("images", f"{images}, {views} used"),
         ("keyframes registered by COLMAP", joined + (f"; other parts: {others}" if others else "")),
         ("reprojection error of COLMAP", f"{structure.error:.2f} px (mean)"),
         ("images with a pose", f"{len(built.posed)} of {views}"),
@@ -63,8 +63,6 @@ def advice(built: Built, views: Sequence[SeenImage]) -> list[str]:
     seconds = np.array([1e-9 * (view.stamp_ns - start) for view in views])
     if np.mean(~posed) > _MANY:
         said.append(f"{_when(~posed, seconds)}, images have no pose: film there more slowly")
-    if np.mean(built.blurred) > _MANY:
-        said.append(f"{_when(built.blurred, seconds)}, images are blurred: more light, less speed")
     if len(built.structure.parts) > 1:
         said.append(
             f"{sum(built.structure.parts[1:])} keyframes are not connected with the others: film "

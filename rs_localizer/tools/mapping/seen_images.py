@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from rs_localizer.config import FeatureKind
-from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.features.extraction import FeatureExtractor, Features
@@ -28,13 +28,9 @@ from rs_localizer.tools.mapping.structure import image_name
 
 # JPEG's quality of what COLMAP gets: at this one, errors are below a grey level.
 _QUALITY = 97
-# A view this much less sharp than those around it (this many each way) is blurred.
-_BLURRED, _AROUND = 0.6, 15
 # A view with fewer features is blurred, dark, or of a blank wall.
 _FEW_FEATURES = 50
 LEAST_VIEWS = 3
-# Pictures in which features move by less than this share of their size (median) show no depth.
-_LEAST_PARALLAX = 0.01
 # COLMAP gets all views of a short recording and this many a second of a long one: at a turn of 60
 # degrees a second, neighbours have three quarters of a picture of 60 degrees in common.
 _KEYFRAMES, _KEYFRAMES_PER_SECOND = 60, 4.0
@@ -88,14 +84,6 @@ class Looker:
             corners, ids = detections.pixels, detections.ids
         features = self._extractor.extract(image.pixels)
         return SeenImage(image.stamp_ns, path, features, sharpness(image.pixels), corners, ids)
-
-
-def blurred(views: Sequence[SeenImage]) -> BoolArray:
-    """Return a mask (n,) of views that are much less sharp than those around them."""
-    values = np.array([view.sharpness for view in views])
-    rows = np.arange(len(values))
-    usual = [np.median(values[max(0, row - _AROUND) : row + _AROUND + 1]) for row in rows]
-    return np.asarray(values < _BLURRED * np.array(usual))
 
 
 @dataclass(slots=True)
@@ -162,18 +150,11 @@ def check_views(views: Sequence[SeenImage]) -> None:
     """Refuse, before minutes of work, views that will make no map.
 
     Raises:
-        MappingError: saying what was found and what to film instead.
+        MappingError: saying what was found.
     """
     if len(views) < LEAST_VIEWS:
         raise MappingError(f"{len(views)} images make no map; at least {LEAST_VIEWS} are needed")
     check_features(views)
-    first, step = views[0], max(1, len(views) // 8)
-    moved = [_moved(first, view) for view in views[step::step]]
-    if all(share < _LEAST_PARALLAX for share in moved):
-        raise MappingError(
-            f"the camera hardly moves (features by {100.0 * max(moved):.1f} % of the picture's "
-            "size): walk sideways and around what is to be mapped"
-        )
 
 
 def check_features(views: Sequence[SeenImage]) -> None:
@@ -188,22 +169,6 @@ def check_features(views: Sequence[SeenImage]) -> None:
             f"the images show {features:.0f} features each (median), at least {_FEW_FEATURES} are "
             "needed: are they blurred, dark, or of blank walls?"
         )
-
-
-def _moved(one: SeenImage, other: SeenImage) -> float:
-    """Return the median motion of features, over the picture's size; infinite: other ones."""
-    if min(len(one.features), len(other.features)) < _FEW_FEATURES:
-        return math.inf
-    matcher = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True)
-    matches = matcher.match(
-        one.features.descriptors.astype(np.float32), other.features.descriptors.astype(np.float32)
-    )
-    here = one.features.pixels[[match.queryIdx for match in matches]]
-    there = other.features.pixels[[match.trainIdx for match in matches]]
-    if len(matches) < _FEW_FEATURES:
-        return math.inf
-    size = np.ptp(np.vstack([here, there]), axis=0).max()
-    return float(np.median(np.linalg.norm(there - here, axis=1)) / size)
 
 
 def choose_keyframes(views: Sequence[SeenImage]) -> IntArray:
