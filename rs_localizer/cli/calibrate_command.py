@@ -36,7 +36,6 @@ if WORKING:
     from rs_localizer.io.maps.files import read_map_file
     from rs_localizer.io.rigs import RigParts
     from rs_localizer.localizer import Localizer
-    from rs_localizer.markers.boards import BoardSizes
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.markers.maps import MarkerMap
     from rs_localizer.offline.detect import seen_by
@@ -225,7 +224,6 @@ def _warn(*faults: str | None) -> None:
 def _detected(args: Options, shots: Iterator[Shot | Carried]) -> _Input:
     marker_map = find_map(args)
     detector = FrameDetector(DetectorConfig(), lambda name, text: None, marker_map)
-    sizes = BoardSizes(marker_map)
     images, frames, refused = list[ImagePoints](), [], dict[str, str]()
     camera: Camera | None = None
     size = (0, 0)
@@ -233,13 +231,12 @@ def _detected(args: Options, shots: Iterator[Shot | Carried]) -> _Input:
     for image, own in tqdm(seen, unit="image", desc="detect", disable=None):
         camera, size = camera or own, image.pixels.shape[::-1]
         found = detector.detect(image).detections
-        sizes.count_board(image.pixels, len(found.points) > 0)
         images.append(ImagePoints(image.stamp_ns, found.points, found.pixels))
         if len(found.points):
             frames.append((found.points, found.pixels, found.ids))
     print(f"{len(frames)} of {len(images)} images show the map")
     image_input.print_left_out(refused)
-    _warn(sizes.fault(), detector.mistake)
+    _warn(detector.mistake)
     find_lens = args.intrinsics or camera is None
     camera = camera or first_lens(size, in_order(images))
     if not detector.mistake:

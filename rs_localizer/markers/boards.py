@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Chessboards and ChArUco boards in images, by OpenCV's own detectors."""
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -12,7 +11,6 @@ from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.markers.dictionaries import Gray
-from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.prints import Charuco, Chessboard
 
 # Half the window of the sub-pixel search, as a share of the smallest distance between corners:
@@ -32,8 +30,6 @@ _LARGEST_SEARCH = 1024
 # OpenCV's search fails in smaller ones (px), which cannot show a board.
 _SMALLEST_SEARCH = 16
 _REFINE_CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
-# The size of a chessboard is looked at in one of this many images, until this many have shown it.
-_EVERY, _SIZES = 10, 9
 
 
 def find_chessboard(image: Gray, board: Chessboard, previous: Array | None = None) -> Array | None:
@@ -104,50 +100,6 @@ def _no_saddles(smooth: Gray, board: Chessboard, corners: Array) -> NDArray[np.b
     contrast = (-1.0) ** (row + column) * (opposite - other)
     typical = np.median(contrast)
     return np.asarray(contrast * np.sign(typical) < _LEAST_CONTRAST * abs(typical)).ravel()
-
-
-class BoardSizes:
-    """Checks from time to time whether a chessboard has the given size.
-
-    Args:
-        marker_map: with the chessboard, if there is one.
-    """
-
-    def __init__(self, marker_map: MarkerMap) -> None:
-        boards = [board for board in marker_map.boards if isinstance(board, Chessboard)]
-        self._board = boards[0] if boards else None
-        self._images = self._next = 0
-        self._sizes: list[tuple[int, int]] = []
-
-    def count_board(self, image: Gray, complete_board: bool) -> None:
-        """Count an image, and whether the board of the given size was found in it."""
-        self._images += 1
-        if self._board is None or self._images <= self._next or len(self._sizes) >= _SIZES:
-            return
-        self._next = self._images + _EVERY
-        small, _ = _shrunk(image)
-        if min(small.shape) < _SMALLEST_SEARCH:
-            return
-        complete, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), cv2.CALIB_CB_LARGER)
-        if complete and meta is not None:
-            rows, columns = sorted(meta.shape)
-            own = sorted((self._board.columns, self._board.rows))
-            larger = rows >= own[0] and columns >= own[1]
-            if larger or not complete_board:  # smaller ones are parts of it
-                self._sizes.append((columns, rows))
-
-    def fault(self) -> str | None:
-        """Describe the size of board that most of the images show, if it is another one."""
-        if self._board is None or not self._sizes:
-            return None
-        size, count = Counter(self._sizes).most_common(1)[0]
-        own = max(self._board.columns, self._board.rows), min(self._board.columns, self._board.rows)
-        if size == own or 2 * count <= len(self._sizes):
-            return None
-        return (
-            f"the images show a chessboard of {size[0]}x{size[1]} inner corners, --board or the "
-            f"map says {self._board.columns}x{self._board.rows}: corners may be mistaken for others"
-        )
 
 
 def find_charuco(

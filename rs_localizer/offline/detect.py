@@ -26,7 +26,7 @@ from rs_localizer.io.recording import (
     KEYPOINTS_TOPIC,
 )
 from rs_localizer.localizer import Localizer
-from rs_localizer.markers.boards import BoardSizes
+from rs_localizer.markers.prints import Chessboard
 from rs_localizer.offline.image_sources import Carried, Shot
 from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
 from rs_localizer.pipeline.marker_detector import Detected, FrameDetector, correspondences
@@ -157,13 +157,11 @@ class _MarkerTally:
         self._others: Counter[str] = Counter()
         self._faults: Counter[str] = Counter()
         self._residuals: list[float] = []
-        self._sizes = BoardSizes(marker_map)
 
     def add(self, camera: Camera, detected: Detected) -> None:
         detections = detected.detections
         self._others.update(detections.unknown)
         self._faults.update(detections.faults)
-        self._sizes.count_board(detected.image.pixels, len(detections.ids) > 0)
         if len(detections.ids):
             self._found.counts.append(len(detections.ids))
             self._residuals.append(static_residual(camera, detected))
@@ -198,8 +196,9 @@ class _MarkerTally:
         if self._others:
             names = ", ".join(name for name, _ in self._others.most_common(5))
             return f"{text}; they show {names}, which the map does not have"
-        fault = self._sizes.fault()
-        return f"{text}; {fault}" if fault else text
+        if any(isinstance(board, Chessboard) for board in self._map.boards):
+            return f"{text}; are these its inner corners, and is all of it in view?"
+        return text
 
     def recorded(self) -> Extraction:
         known = [value for value in self._residuals if np.isfinite(value)]
@@ -211,8 +210,6 @@ class _MarkerTally:
                 f"even the stillest images leave {least:.1f} px rms: the calibration can hardly be "
                 "of this camera in this mode, or the map (sizes, positions) is wrong"
             )
-        if fault := self._sizes.fault():
-            faults.append(fault)
         self._found.faults = tuple(faults)
         if known:
             self._found.residual = float(np.median(known))

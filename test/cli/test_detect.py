@@ -220,7 +220,7 @@ def test_what_is_seen_instead_is_named(here, monkeypatch, capsys):
     images = folder(here.path / "images", [board(7, 5)] * 6)
     assert detect(here, images, *here.calibration, *here.board, "--rate", "30") == 1
     said = capsys.readouterr().err
-    shows = r"shows anything of the map \(chessboard 6x4\); the images show a chessboard of 7x5"
+    shows = r"shows anything of the map \(chessboard 6x4\); are these its inner corners"
     assert re.search(f"note: none of the first 4 images {shows}", said)
     assert re.search(f"detect: none of the 6 images {shows}", said)
     assert not here.out.exists()
