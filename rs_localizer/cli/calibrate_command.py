@@ -24,7 +24,6 @@ from rs_localizer.io.topics import CAMERA_INFO, IMAGE, IMU
 
 if WORKING:
     import numpy as np
-    from scipy.spatial.transform import Rotation
     from tqdm import tqdm
 
     from rs_localizer.config import CalibrationErrors, DetectorConfig, NodeConfig
@@ -45,7 +44,6 @@ if WORKING:
         optical_frame,
         read_imu_recording,
         read_recording,
-        transform_between,
     )
     from rs_localizer.offline.replay import find_topics, has_frames
     from rs_localizer.pipeline.marker_detector import FrameDetector
@@ -55,7 +53,7 @@ if WORKING:
     from rs_localizer.tools.adjust.intrinsics import LensErrors
     from rs_localizer.tools.adjust.observe import ImagePoints, in_order
     from rs_localizer.tools.camera_calibration import CameraCalibration, calibrate
-    from rs_localizer.tools.first_lens import covered, first_lens
+    from rs_localizer.tools.first_lens import first_lens
     from rs_localizer.tools.rig_mounts import Mounted, Recording, calibrate_rig
 
 # Names of the files beside FILE.yaml, after FILE_.
@@ -159,10 +157,6 @@ def _calibrated(
     args: Options, source: _Input, camera: Camera, config: NodeConfig
 ) -> CameraCalibration:
     """Calibrate a camera by its images and print the result."""
-    shown = covered(camera.size, (image.pixels for image in source.images))
-    print(f"all images together show the map in {shown:.0%} of the image")
-    gyro = "" if source.imu is None else ", the same with the gyroscope"
-    print(f"steps: a pose for each image, one motion through them{gyro}, and parts of it")
     with tqdm(total=len(source.images), unit="image", desc="localize", disable=None) as bar:
         found = calibrate(
             camera, source.images, intrinsics=source.find_lens, imu=source.imu,
@@ -360,14 +354,6 @@ def _calibrate_rig(args: Options) -> dict[str, Figures]:
     for name, mounted in list(rig.items())[1:]:
         comments += mounting_lines(name, first, mounted.extrinsics, mounted.deviations)
         print("\n".join(comments[-3:]))
-        if np.any(mounted.inflations > 1.0):
-            times = verdict.numbers(mounted.inflations, 1)
-            print(
-                "parts of the recording differ by more than their noise: the deviations of "
-                f"rotation, place and offset are {times} times that"
-            )
-        if len(args.recordings) == 1 and is_bag(args.recordings[0]):
-            _compare_with_tf(args.recordings[0], mounted, cameras[name][1], cameras[first][1])
     if refusals := [f"{name}: {one.undetermined}" for name, one in rig.items() if one.undetermined]:
         raise ValueError(f"not observable: {'; '.join(refusals)}")
     if args.out is not None:
@@ -390,17 +376,6 @@ def _without_k3(camera: Camera) -> Camera:
     if camera.distortion_model != DistortionModel.PLUMB_BOB or np.any(camera.D[4:]):
         return camera
     return replace(camera, D=np.r_[camera.D, np.zeros(4)][:4])
-
-
-def _compare_with_tf(path: Path, found: Mounted, own: str, first: str) -> None:
-    """Print how TF of a bag differs from a camera's estimated pose in the first one's frame."""
-    with open_bag(path) as bag:
-        given = transform_between(bag, own, first)
-    if given is not None:
-        mounted = found.extrinsics
-        off = np.degrees(Rotation.from_matrix(given.rotation.T @ mounted.axes).magnitude())
-        away = given.rotation.T @ given.translation + mounted.centre
-        print(f"TF has it {off:.2f} deg and {1e3 * np.linalg.norm(away):.1f} mm off")
 
 
 def _parts(

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from itertools import pairwise
 from typing import Any
 
@@ -41,20 +40,6 @@ _RICHER = 0.9
 # Least angle (rad) from the axis to a corner of a fisheye: numbers of a narrower one compensate
 # each other, and the other kinds describe it as well.
 _FISHEYE = 1.0
-
-
-_CELLS = 64  # along the longer side
-
-
-def covered(size: tuple[int, int], images: Iterable[Array]) -> float:
-    """Return the share of an image inside the hull of its pixels (n,2) in any of some images."""
-    shape = np.maximum(np.ceil(_CELLS * np.array(size) / max(size)), 1.0).astype(int)
-    mask = np.zeros(shape[::-1], np.uint8)
-    for pixels in images:
-        if len(pixels):
-            cells = np.floor((pixels + 0.5) * shape / size).astype(np.int32)
-            cv2.fillConvexPoly(mask, cv2.convexHull(cells), 1)
-    return float(mask.mean())
 
 
 def first_lens(size: tuple[int, int], images: list[ImagePoints]) -> Camera:

@@ -70,8 +70,6 @@ class Mounted:
     # ``offset``: s, to add to its stamps, of first rows, for the time of the first camera's.
     extrinsics: Extrinsics
     deviations: Array  # (7,) of a step of these: rad, m, s
-    # Factors of the seven deviations above, by the disagreement of parts of the recording; 1: none.
-    inflations: Array
 
     @property
     def undetermined(self) -> str:
@@ -249,17 +247,15 @@ def _mounted(place: int, whole: _Joint, parts: list[_Joint]) -> Mounted:
     state = whole.states[place]
     extrinsics = state.extrinsics
     values, deviations = whole.numbers(place, extrinsics)
-    inflations, beside = np.ones(EXTRINSICS), np.zeros(EXTRINSICS)
     if place > 0 and len(parts) > 1:
         each = np.array([part.numbers(place, extrinsics) for part in parts])
         for k, (own, noise) in enumerate(each.transpose(2, 1, 0)):
-            inflations[k] = disagreement(own, noise)
-            beside[k] = discrepancy(float(values[k]), own, inflations[k] * noise)
-    deviations = np.hypot(inflations * deviations, beside)
+            inflation = disagreement(own, noise)
+            beside = discrepancy(float(values[k]), own, inflation * noise)
+            deviations[k] = math.hypot(inflation * deviations[k], beside)
     return Mounted(
         camera=with_lens(whole.problem.views[place].camera, state.lens),
         readout_time=state.readout_time,
         extrinsics=replace(extrinsics, offset=float(values[6])),
         deviations=deviations,
-        inflations=inflations,
     )
