@@ -255,13 +255,10 @@ def apart_of(halves: tuple[Block, ...]) -> tuple[float, float]:
     return abs(one.readout_time - other.readout_time), noise
 
 
-# A readout time is believed beyond this many deviations: two axes with two directions each are
-# tried, four chances together one in 8,000, and deviations, which few seconds tell, may be too
-# small by a third.
-_SIGNIFICANT = 4.0
-# And where the images' gains are so by chance less often than this: a wrong model that absorbs
-# something else helps some images and harms others.
-CHANCE = 0.01
+# A readout time is believed beyond this many deviations, which few seconds tell: they may be too
+# small by a third. And where the images' gains are so by chance less often than this: a wrong model
+# that absorbs something else helps some images and harms others.
+_SIGNIFICANT, _CHANCE = 4.0, 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,7 +272,6 @@ class ShutterFit:
     global_noise: float  # px, that the global shutter leaves which fits best
     better_images: float  # share of the images that fit it better than a global shutter
     chance: float  # that the images' gains over a global shutter are so by chance
-    axis_chance: float  # likewise, over a shutter along the other axis; 0: not tried
     interval: float  # s, between the images
 
     @property
@@ -287,12 +283,7 @@ class ShutterFit:
     def visible(self) -> bool:
         """True where the images show a rolling shutter."""
         significant = self.readout_time > _SIGNIFICANT * self.deviation
-        return significant and self.chance < CHANCE and self.possible
-
-    @property
-    def axis_known(self) -> bool:
-        """True where they show along which axis it goes."""
-        return self.axis_chance < CHANCE
+        return significant and self.chance < _CHANCE and self.possible
 
 
 # A time is another one if it differs from the given one by this many deviations, and by this (s).

@@ -6,8 +6,8 @@
    finds the lens as well.
 2. The views between them are localized on that map.
 3. Motion and the most useful landmarks are adjusted together, each keypoint at its row's time. A
-   readout time that nobody knows is estimated along both axes of the image, and believed where it
-   explains the images better than a global shutter.
+   readout time that nobody knows is estimated, and believed where it explains the images better
+   than a global shutter.
 4. All landmarks are triangulated with that motion, and so is what gives the map its metres.
 """
 
@@ -47,7 +47,7 @@ from rs_localizer.tools.mapping.seen_images import (
 from rs_localizer.tools.mapping.shutter_fit import (
     LEAST_FIT,
     colmap_freedom,
-    likely_axes,
+    likely_axis,
     refine_with_shutter,
 )
 from rs_localizer.tools.mapping.structure import Effort, Stage, Structure, build_structure
@@ -160,7 +160,7 @@ def build_map(inputs: Given, work: Workshop) -> Built:
     camera = replace(
         structure.camera,
         readout_time=inputs.readout_time or 0.0,
-        scan_direction=likely_axes(structure.camera.size, inputs.scan_direction)[0],
+        scan_direction=likely_axis(structure.camera.size, inputs.scan_direction),
     )
     with work.stage("track", len(inputs.views)) as step:
         tracked = track_on_map(inputs.views, structure, camera, lambda: step(1))
@@ -254,11 +254,9 @@ def _refined(
             camera, observations, start, corners, places
         )
         freedom = replace(freedom, deviations=deviations)
-    directions, given = likely_axes(camera.size, inputs.scan_direction), inputs.readout_time
-    with work.stage("refine", 3 if given is not None else 3 * (1 + len(directions))) as step:
-        return refine_with_shutter(
-            camera, observations, start, freedom, (given, directions), lambda _: step(1)
-        )
+    given = inputs.readout_time
+    with work.stage("refine", 3 if given is not None else 6) as step:
+        return refine_with_shutter(camera, observations, start, freedom, given, lambda _: step(1))
 
 
 def _corners(inputs: Given, stamps_ns: IntArray) -> MapObservations:

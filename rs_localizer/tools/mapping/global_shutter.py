@@ -27,7 +27,7 @@ from rs_localizer.tools.mapping.refinement import RefinedMap
 from rs_localizer.tools.mapping.shutter_fit import (
     colmap_freedom,
     global_errors,
-    likely_axes,
+    likely_axis,
     refine_with_shutter,
 )
 from rs_localizer.tools.mapping.structure import HALF, Effort, observed
@@ -81,9 +81,9 @@ def undo_shutter(
         raise MappingError(
             f"no image of the model shows {LEAST_KEYPOINTS} points that three images see"
         )
-    freedom, directions = colmap_freedom(some, near, lens), likely_axes(camera.size, shutter[1])
+    camera = replace(camera, scan_direction=likely_axis(camera.size, shutter[1]))
     refined, found, check = refine_with_shutter(
-        camera, some, near, freedom, (shutter[0], directions), done
+        camera, some, near, colmap_freedom(some, near, lens), shutter[0], done
     )
     motion = ViewMotion(used, refined.times, refined)
     projected = motion.sights(seen.images, seen.landmarks, seen.pixels)

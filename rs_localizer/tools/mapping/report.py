@@ -77,7 +77,7 @@ def advice(built: Built, views: Sequence[SeenImage]) -> list[str]:
             "show markers at both ends"
         )
     shutter = built.shutter
-    known = shutter.visible and shutter.axis_known if shutter else not built.refined.apart
+    known = shutter.visible if shutter else not built.refined.apart
     if not known:
         said.append(
             "for the readout time, film at the camera's own rate (no time lapse, no stabilization) "
@@ -111,14 +111,13 @@ def _of_shutter(built: Built) -> list[tuple[str, str]]:
             text = "invisible: no smooth motion joins the images, each has a pose of its own"
         return [("readout time", text)]
     best = f"{1e3 * fit.readout_time:.2f} +- {1e3 * fit.deviation:.2f} ms, {fit.direction}"
-    axis = "" if fit.axis_known else ", or along the other axis, which fits equally well"
     why = "" if fit.possible else f", longer than {1e3 * fit.interval:.1f} ms between images"
     noises = (
         f"{fit.noise:.3f} px, with a global shutter {fit.global_noise:.3f} px; "
         f"{100 * fit.better_images:.0f} % of the images fit better"
     )
     if fit.visible:
-        return [("readout time", f"{best} (estimated{axis})"), ("noise with that", noises)]
+        return [("readout time", f"{best} (estimated)"), ("noise with that", noises)]
     return [
         ("readout time", f"invisible in these images (best fit {best}{why})"),
         ("noise with that", noises),

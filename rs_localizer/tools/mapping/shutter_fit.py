@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 
@@ -18,22 +18,21 @@ from rs_localizer.tools.adjust.reprojection import LIMIT
 from rs_localizer.tools.mapping.initial_trajectory import usual_accelerations
 from rs_localizer.tools.mapping.map_keypoints import MapFreedom, MapObservations, Start
 from rs_localizer.tools.mapping.refinement import RefinedMap, refine
-from rs_localizer.tools.readout_belief import CHANCE, ReadoutCheck, ShutterFit
+from rs_localizer.tools.readout_belief import ReadoutCheck, ShutterFit
 
 LEAST_FIT = 0.8
 """Share of the keypoints that fit a good map: nine in ten do."""
 
 
-def likely_axes(size: tuple[int, int], given: str | None) -> list[ScanDirection]:
-    """Return scan directions to try, with their reverses, likelier first; only a given one.
+def likely_axis(size: tuple[int, int], given: str | None) -> ScanDirection:
+    """Return a given scan direction, or the likely one, reversed if the readout time is negative.
 
     The rows of sensors lie along their longer side, also where a driver or a phone has turned the
     images.
     """
     if given is not None:
-        return [ScanDirection(given)]
-    axes = [ScanDirection.TOP_TO_BOTTOM, ScanDirection.LEFT_TO_RIGHT]
-    return axes if size[0] >= size[1] else axes[::-1]
+        return ScanDirection(given)
+    return ScanDirection.TOP_TO_BOTTOM if size[0] >= size[1] else ScanDirection.LEFT_TO_RIGHT
 
 
 # Standard deviations of COLMAP's lens: focal length and centre over the focal length (of one
@@ -64,7 +63,6 @@ def fit_shutter(
     observations: MapObservations,
     start: Start,
     freedom: MapFreedom,
-    directions: Sequence[ScanDirection],
     done: Callable[[str], object],
 ) -> tuple[RefinedMap, ShutterFit | None]:
     """Refine the map with the shutter that explains the images best.
@@ -74,9 +72,8 @@ def fit_shutter(
     own pose, as in COLMAP, and the shutter stays unknown.
 
     Args:
-        camera: its lens; the shutter does not matter.
+        camera: its lens, and the axis of its scan.
         observations, start, freedom: as of :func:`refine`.
-        directions: to try, each with its reverse; the first is preferred where they fit alike.
         done: called with each part of the work that is done.
 
     Returns:
@@ -86,10 +83,9 @@ def fit_shutter(
     Raises:
         ValueError: as :func:`refine`.
     """
-    camera = replace(camera, readout_time=0.0, scan_direction=directions[0])
-    smooth = None
+    camera, smooth = replace(camera, readout_time=0.0), None
     with suppress(ValueError):  # what is wrong with the images is raised below
-        smooth = _of_one_motion(camera, observations, start, freedom, directions, done)
+        smooth = _of_one_motion(camera, observations, start, freedom, done)
         best = smooth[0]
         if best.fit_share >= LEAST_FIT and best.after <= _noise(camera, observations, start):
             return smooth
@@ -104,25 +100,21 @@ def fit_shutter(
 
 def refine_with_shutter(
     camera: Camera, observations: MapObservations, start: Start, freedom: MapFreedom,
-    shutter: tuple[float | None, Sequence[ScanDirection]], done: Callable[[str], object],
+    given: float | None, done: Callable[[str], object],
 ) -> tuple[RefinedMap, ShutterFit | None, ReadoutCheck | None]:  # fmt: skip
     """Refine the map with a given readout time (s), and check it.
 
-    Else, or where the images contradict it, as of :func:`fit_shutter`.
-
-    Args:
-        shutter: the readout time, if one is given, and the directions.
+    Else, or where the images contradict it, as of :func:`fit_shutter`: a map that was adjusted with
+    the wrong one is bent to it, and fits it nearly as well.
     """
-    check, (given, directions) = None, shutter
+    check = None
     if given is not None:
-        known = replace(camera, readout_time=given, scan_direction=directions[0])
+        known = replace(camera, readout_time=given)
         refined = refine(known, observations, start, freedom, done=done)
         check = refined.readout_check
         if check is None or not check.differs:
             return refined, None, check
-        # A map adjusted with the wrong one is bent to it, and fits it nearly as well.
-        directions = directions[:1]
-    return *fit_shutter(camera, observations, start, freedom, directions, done), check
+    return *fit_shutter(camera, observations, start, freedom, done), check
 
 
 def global_errors(camera: Camera, observations: MapObservations, start: Start) -> Array:
@@ -139,37 +131,29 @@ def _noise(camera: Camera, observations: MapObservations, start: Start) -> float
 
 def _of_one_motion(
     camera: Camera, observations: MapObservations, start: Start, freedom: MapFreedom,
-    directions: Sequence[ScanDirection], done: Callable[[str], object],
+    done: Callable[[str], object],
 ) -> tuple[RefinedMap, ShutterFit | None]:  # fmt: skip
     """Refine by one smooth motion through successive images; see :func:`fit_shutter`."""
+    from scipy.stats import wilcoxon  # takes a second
+
     still = refine(camera, observations, start, freedom, done=done)
     if not still.tells_readout:
         return still, None
-    freedom = replace(freedom, readout_time=True)
-    fits = [
-        refine(
-            replace(still.camera, scan_direction=direction), observations, start, freedom, done=done
-        )
-        for direction in directions
-    ]
-    costs = [_costs(of, still, observations) for of in (still, *fits)]
-    best, axis_chance = 0, 0.0
-    if len(fits) > 1:
-        first, second = (_chance(costs[3 - k] - costs[k]) for k in (1, 2))
-        best, axis_chance = int(second < CHANCE), min(first, second)
-    gains, chosen = costs[0] - costs[1 + best], fits[best]
+    free = replace(freedom, readout_time=True)
+    rolling = refine(still.camera, observations, start, free, done=done)
+    gains = _costs(still, still, observations) - _costs(rolling, still, observations)
     shutter = ShutterFit(
-        readout_time=chosen.camera_as_found.readout_time,
-        deviation=chosen.readout_time_deviation,
-        direction=ScanDirection(chosen.camera_as_found.scan_direction),
-        noise=chosen.after,
+        readout_time=rolling.camera_as_found.readout_time,
+        deviation=rolling.readout_time_deviation,
+        direction=ScanDirection(rolling.camera_as_found.scan_direction),
+        noise=rolling.after,
         global_noise=still.after,
         better_images=float(np.mean(gains > 0.0)),
-        chance=_chance(gains),
-        axis_chance=axis_chance,
+        # Images at rest gain nothing, those of a quick turn much: the signed-rank test.
+        chance=float(wilcoxon(gains, alternative="greater").pvalue),
         interval=1e-9 * float(np.median(np.diff(observations.stamps_ns))),
     )
-    return (chosen if shutter.visible else still), shutter
+    return (rolling if shutter.visible else still), shutter
 
 
 def _costs(fit: RefinedMap, still: RefinedMap, observations: MapObservations) -> Array:
@@ -178,13 +162,3 @@ def _costs(fit: RefinedMap, still: RefinedMap, observations: MapObservations) ->
     squared = np.minimum(np.where(np.isfinite(fit.squared_errors), fit.squared_errors, 0.0), limit)
     sums = np.bincount(observations.images, squared, len(observations.stamps_ns))
     return np.asarray(sums, np.float64)
-
-
-def _chance(gains: Array) -> float:
-    """Return the probability of such gains (g,) by chance (Wilcoxon's signed-rank test).
-
-    Images at rest gain nothing, those of a quick turn much.
-    """
-    from scipy.stats import wilcoxon  # takes a second
-
-    return float(wilcoxon(gains, alternative="greater").pvalue)
