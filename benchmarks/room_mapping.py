@@ -9,7 +9,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.images import Image
 from rs_localizer.io.recording import CAMERA_FRAME
 from rs_localizer.io.trajectories import Trajectory
-from rs_localizer.tools.simulation.renderer import Renderer, in_order
+from rs_localizer.tools.simulation.renderer import Renderer
 from rs_localizer.tools.simulation.simulated_frames import frame_stamps
 from rs_localizer.tools.simulation.simulated_settings import ImageSettings
 from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
@@ -51,4 +51,4 @@ class Room:
             pixels = self._renderer.image(self.motion, stamp, (0, stamp))
             return Image(stamp, CAMERA_FRAME, pixels)
 
-        return in_order(render, self.stamps(piece))
+        return map(render, self.stamps(piece))

@@ -8,11 +8,9 @@ at its own time; the lens distortion bends the rays of the pixels, never their t
 
 import math
 import os
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -157,8 +155,7 @@ def _rays(camera: Camera, sideways: bool) -> NDArray[np.float32]:
 FORMAT = "jpeg"
 """Format of sensor_msgs/CompressedImage."""
 _QUALITY = 95  # its artefacts stay below the noise of a corner
-T = TypeVar("T")
-R = TypeVar("R")
+_WORKERS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,27 +192,14 @@ def rendered_frames(
             middle_row=motion.state(middle_ns, now),
         )
 
-    yield from in_order(frame, enumerate(stamps_ns))
+    # A few at a time wait to be taken.
+    numbered = list(enumerate(stamps_ns))
+    with ThreadPoolExecutor(_WORKERS) as pool:
+        for first in range(0, len(numbered), 2 * _WORKERS):
+            yield from pool.map(frame, numbered[first : first + 2 * _WORKERS])
 
 
 def _jpeg(image: Image) -> bytes:
     done, data = cv2.imencode(f".{FORMAT}", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     assert done
     return bytes(data.tobytes())
-
-
-def in_order(work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """Yield results of ``map`` with a thread per core; only a few wait to be taken."""
-    workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2
-    waiting: deque[Future[R]] = deque()
-    with ThreadPoolExecutor(workers) as pool:
-        try:
-            for item in items:
-                waiting.append(pool.submit(work, item))
-                if len(waiting) > 2 * workers:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            for future in waiting:
-                future.cancel()

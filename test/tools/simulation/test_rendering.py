@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rendered images against plain ray casting, OpenCV's warping and analytic projections."""
 
-import threading
-import time
 from dataclasses import replace
 
 import cv2
@@ -12,7 +10,7 @@ import pytest
 
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
-from rs_localizer.tools.simulation.renderer import Renderer, in_order
+from rs_localizer.tools.simulation.renderer import Renderer
 from rs_localizer.tools.simulation.simulated_settings import ImageSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 from rs_localizer.tools.simulation.walls import TexturedPlane
@@ -131,32 +129,3 @@ def test_exposure_blurs_along_the_motion_and_shifts_nothing():
     assert len(ramp) == pytest.approx(0.9 * travel, abs=2)
     np.testing.assert_allclose(np.diff(blurred[ramp]).mean(), 200.0 / travel, rtol=0.1)
     assert (blurred - sharp).sum() == pytest.approx(0.0, abs=100.0)  # half a pixel
-
-
-def test_results_come_in_order_and_few_wait():
-    started: list[int] = []
-
-    def work(item: int) -> int:
-        started.append(item)
-        time.sleep(0.002 * (7 * item % 5))
-        return item**2
-
-    results = in_order(work, range(200))
-    assert [next(results) for _ in range(3)] == [0, 1, 4]
-    time.sleep(0.1)  # nobody takes more: nothing is made ahead without bound
-    assert len(started) < 100
-    assert list(results) == [item**2 for item in range(3, 200)]
-
-
-def test_an_error_ends_the_work():
-    before = threading.active_count()
-
-    def work(item: int) -> int:
-        if item == 5:
-            raise ValueError("five")
-        return item
-
-    results = in_order(work, iter(range(10**9)))
-    with pytest.raises(ValueError, match="five"):
-        list(results)
-    assert threading.active_count() == before
