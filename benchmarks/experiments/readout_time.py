@@ -118,10 +118,10 @@ def run(context: Context) -> Result:
         {
             "readout_time": Table(
                 ("scene", "direction", "outliers", "truth_ms", "error_us", "deviation_us",
-                 "bound_us", "odds_log10"),
+                 "bound_us"),
                 [
                     (t.scene, str(t.direction), t.outliers, 1e3 * t.truth, 1e6 * t.error,
-                     1e6 * t.found.deviation, 1e6 * t.bound, t.found.odds)
+                     1e6 * t.found.deviation, 1e6 * t.bound)
                     for t in trials
                 ],
             )

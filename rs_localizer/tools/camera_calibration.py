@@ -17,7 +17,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.imu import ImuRecording
 from rs_localizer.tools.adjust.bodies import is_flat
-from rs_localizer.tools.adjust.fit import Fit, cheaper, cost_at, fit, image_speeds
+from rs_localizer.tools.adjust.fit import Fit, cheaper, fit, image_speeds
 from rs_localizer.tools.adjust.intrinsics import LensErrors, lens_difference, lens_errors
 from rs_localizer.tools.adjust.observe import ImagePoints, Posed, collect, in_order, localize_each
 from rs_localizer.tools.adjust.spline import LONGEST_SPACING, Spline, first_spline, refined
@@ -303,7 +303,6 @@ def _judged(
     fitted: Fit,
     images: int,
 ) -> CameraCalibration:
-    opposite = cost_at(camera, observations, fitted, -fitted.state.readout_time)
     blocks, halves = (
         blocks_of(camera, observations, fitted),
         blocks_of(camera, observations, fitted, 2),
@@ -336,7 +335,6 @@ def _judged(
         seconds=float(np.ptp(posed.times)),
         lens=lens,
         inflation=inflation,
-        reversed_cost=opposite - fitted.cost,
         stamps=stamps,
         fit=fitted,
         posed=posed,

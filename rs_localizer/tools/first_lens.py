@@ -99,9 +99,8 @@ def _calibrated(
             lens = Camera(*size, K=K, D=D.ravel(), distortion_model=model)
         except (cv2.error, ValueError):  # numbers that no camera has
             continue
-        errors = np.array([
-            _error(lens, image, *pose) for image, *pose in zip(images, turns, places, strict=True)
-        ])  # fmt: skip
+        poses = zip(images, turns, places, strict=True)
+        errors = np.array([_error(lens, image, turn, place) for image, turn, place in poses])
         total = np.sum(errors**2)
         if np.isfinite(total) and (best is None or total < np.sum(best[1] ** 2)):
             best = lens, errors
@@ -115,7 +114,7 @@ def _fisheye_flags() -> int:
     return int(sum(every))
 
 
-def _error(lens: Camera, image: ImagePoints, turn: Array, place: Array) -> float:
+def _error(lens: Camera, image: ImagePoints, turn: Any, place: Any) -> float:
     local = image.points @ cv2.Rodrigues(turn)[0].T + place.ravel()
     off = lens.project(local) - image.pixels
     return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))

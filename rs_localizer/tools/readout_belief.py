@@ -129,16 +129,10 @@ class Evidence:
     blocks: tuple[Block, ...]
     halves: tuple[Block, ...]
     inflation: float  # of the deviation, because the blocks disagree; 1: they do not
-    reversed_cost: float  # by how much the reversed direction costs more, noise variances
     stamps: Stamps
     own_stamps: bool  # the images' own, not those of a rate
     jitter: float  # s rms, by how much images were exposed beside their stamps; 0: they were not
     seconds: float  # how long the images with a pose last
-
-    @property
-    def odds(self) -> float:
-        """Decimal logarithm of the odds for the direction of the sign."""
-        return 0.5 * self.reversed_cost / self.inflation**2 / math.log(10.0)
 
     @property
     def limit(self) -> float:

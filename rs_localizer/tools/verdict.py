@@ -85,8 +85,6 @@ def remarks(result: CameraCalibration) -> list[str]:
             f"global shutter: 0 lies within the error of {1e3 * result.readout_time:+.3f} +- "
             f"{1e3 * result.deviation:.3f} ms"
         )
-    elif not refusal(result):
-        said.append(f"direction: the reversed one is 10^{result.odds:.0f} times less likely")
     if result.stamps.irregular:
         said.append(
             f"stamps are irregular: {1e3 * result.stamps.jitter:.2f} ms rms about even intervals"

@@ -15,13 +15,12 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.tools.adjust.intrinsics import with_lens
-from rs_localizer.tools.adjust.problem import Problem, fit_with_noise, minimise
+from rs_localizer.tools.adjust.problem import Problem, fit_with_noise
 from rs_localizer.tools.adjust.reprojection import LIMIT
 from rs_localizer.tools.adjust.spline_kernels import CONTROL
 from rs_localizer.tools.adjust.system import Factored
 from rs_localizer.tools.adjust.variables import CameraView, Freedom, SplineKeypoints, Unknowns
 
-_FEW_STEPS = 6
 # Richer models must lower the cost by this much per new parameter (Akaike).
 _COST_PER_PARAMETER = 2.0
 
@@ -90,20 +89,6 @@ def solve(problem: Problem, start: Unknowns, deviation: float | None = None) -> 
         state, deviation = fit_with_noise(trusted, start, trusted.noise(start, np.inf))
     state, deviation = fit_with_noise(problem, state, deviation)
     return _finish(problem, state, deviation)
-
-
-def cost_at(
-    camera: Camera, observations: SplineKeypoints, fitted: Fit, readout_time: float
-) -> float:
-    """Return the least cost with this readout time (s), to be compared with ``fitted.cost``.
-
-    Less exact where it is far from the least of all.
-    """
-    held = replace(fitted.freedom, readout_time=False)
-    start = replace(fitted.state, readout_time=readout_time)
-    problem = Problem([CameraView(camera, observations, held)], start)
-    least = minimise(problem, start, fitted.deviation, _FEW_STEPS)
-    return problem.system(least, fitted.deviation).cost
 
 
 def cheaper(richer: Fit, plainer: Fit, parameters: float) -> bool:

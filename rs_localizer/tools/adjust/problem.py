@@ -243,12 +243,12 @@ class Problem:
         return sum(len(np.unique(of[own])) for of, own in zip(frames, parts, strict=True))
 
 
-def minimise(problem: Problem, state: Unknowns, deviation: float, steps: int = _STEPS) -> Unknowns:
-    """Minimize the cost near a state, by Levenberg and Marquardt, in this many steps."""
+def minimise(problem: Problem, state: Unknowns, deviation: float) -> Unknowns:
+    """Minimize the cost near a state, by Levenberg and Marquardt."""
     system = problem.system(state, deviation)
     damping = _FIRST_DAMPING
     most = LIMIT**2 / 3.0 * sum(len(view.observations.points) for view in problem.views)
-    for _ in range(steps):
+    for _ in range(_STEPS):
         for _ in range(_MOST_DAMPINGS):
             cost = math.inf
             try:

@@ -99,7 +99,8 @@ def _turned_over(seen: SplineKeypoints, state: Unknowns) -> Array:
     times = np.clip(seen.times, layout.starts.min(), layout.ends.max())
     toward: Array = state.spline.states(times).positions - middles[markers]
     toward /= np.linalg.norm(toward, axis=1)[:, None]
-    sight = np.column_stack([np.bincount(markers, of, len(corners)) for of in toward.T])
+    sums = [np.bincount(markers, of, len(corners)) for of in toward.T]
+    sight: Array = np.column_stack(sums).astype(float)
     sight /= np.maximum(np.linalg.norm(sight, axis=1), 1e-12)[:, None]
     depth = np.einsum("mci,mi->mc", corners - middles[:, None], sight)
     return np.asarray(corners - 2.0 * depth[..., None] * sight[:, None]).reshape(-1, 3)

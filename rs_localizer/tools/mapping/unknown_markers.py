@@ -185,8 +185,13 @@ def _square_poses(corners: Array, rays: Array, doubt: float) -> list[tuple[Trans
         return []
     fits = np.exp(-(np.ravel(errors) - np.min(errors)) / doubt)
     return [
-        (Transform(Rotation.from_rotvec(turn.ravel()).as_matrix(), place.ravel()), fit)
-        for turn, place, fit in zip(turns, places, fits.tolist(), strict=True)
+        (Transform(Rotation.from_rotvec(turn).as_matrix(), place), fit)
+        for turn, place, fit in zip(
+            np.reshape(turns, (-1, 3)),
+            np.reshape(places, (-1, 3)).astype(float),
+            fits.tolist(),
+            strict=True,
+        )
         if place[2] > 0.0
     ]
 

@@ -53,7 +53,6 @@ def test_readout_time_and_direction(scene, request):
     found = request.getfixturevalue(scene)
     agrees(found, 0.02, 1e-4)
     assert verdict.scan_direction(found) == "top_to_bottom"
-    assert found.odds > 10.0
     assert found.jitter == 0.0
     assert verdict.refusal(found) == ""
 
@@ -102,7 +101,6 @@ def test_a_picture_that_is_turned_after_the_fact_makes_parts_disagree():
     first, *_ = verdict.table(found, None)  # before figures that look like findings
     assert first.startswith("warning: parts of the recording disagree (")
     assert "is image stabilization on" in first
-    assert not any("times less likely" in remark for remark in verdict.remarks(found))
 
 
 @pytest.mark.parametrize("model", ["equidistant", "plumb_bob"])
