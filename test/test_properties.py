@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from benchmarks.fuzzing.seeds import map_rows
+from benchmarks.fuzzing import map_rows
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.clouds import make_cloud, read_map
 from rs_localizer.io.maps.files import read_map_file, write_npz

@@ -75,8 +75,8 @@ class Options(TargetOptions, ImageOptions, ResultOptions):
     )  # fmt: skip
     intrinsics: bool = option("find the lens as well", default=False)
     imu: bool = option(
-        "find how the IMU of a bag or of a video goes with the camera: offset of its stamps, "
-        "rotation, bias", default=False,
+        "find how the IMU of a bag goes with the camera: offset of its stamps, rotation, bias",
+        default=False,
     )  # fmt: skip
     out: Path | None = option(
         "all that is known of the camera or the rig, lens and shutter: --camera of the other "

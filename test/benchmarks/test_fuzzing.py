@@ -4,8 +4,7 @@
 
 from typing import Any
 
-from benchmarks.fuzzing.campaign import case_of, run
-from benchmarks.fuzzing.targets import Target, targets
+from benchmarks.fuzzing import Target, case_of, run, targets
 
 EXECUTIONS = 6000
 

@@ -7,7 +7,7 @@ import recorded
 from numpy.lib.recfunctions import repack_fields
 from recorded import SHUTTER, record
 
-from benchmarks.fuzzing.seeds import map_rows
+from benchmarks.fuzzing import map_rows
 from rs_localizer.cli.commands import main
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rs_localizer.pipeline.keypoint_map
-from benchmarks.fuzzing.seeds import map_rows
+from benchmarks.fuzzing import map_rows
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message

@@ -22,7 +22,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2, PointField
 
-from benchmarks.fuzzing.seeds import map_rows
+from benchmarks.fuzzing import map_rows
 from rs_localizer.io.bags import typestore
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.landmarks import Map
