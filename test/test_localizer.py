@@ -191,19 +191,6 @@ def test_other_processes_get_the_same_from_a_localizer_that_is_sent(how):
         assert_same_bits(pool.starmap_async(localizer.localize, FRAMES).get(60))
 
 
-def test_workers_of_dask_get_the_same():
-    distributed = pytest.importorskip("distributed", reason="needs Dask")
-    localizer = rsl.Localizer(camera())
-    with (
-        distributed.LocalCluster(
-            n_workers=1, threads_per_worker=2, processes=True, dashboard_address=":0"
-        ) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        work = [client.submit(localizer.localize, *each) for each in FRAMES]
-        assert_same_bits([each.result(timeout=60) for each in work])
-
-
 def resident():
     """kB of this process that are in memory."""
     return int(re.search(r"VmRSS:\s+(\d+)", pathlib.Path("/proc/self/status").read_text())[1])

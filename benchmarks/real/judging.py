@@ -18,7 +18,6 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.scanning import REVERSED, ScanDirection
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.core.state import ANGULAR, POSE, VELOCITIES
 from rs_localizer.core.types import Estimate, Failure
@@ -90,7 +89,7 @@ def localized(
 
 
 def jitter(clip: Clip, poses: Poses, others: Poses) -> dict[str, float]:
-    """Second differences of a method over those of another, on the images that both localize."""
+    """Second differences of orientation over those of another method, on images both localize."""
     pairs = []
     stamps = np.array([image.stamp_ns for image in clip.images]) * 1e-9
     for k in range(1, len(poses) - 1):
@@ -102,22 +101,20 @@ def jitter(clip: Clip, poses: Poses, others: Poses) -> dict[str, float]:
         pairs.append([_second_difference(triple) for triple in triples])
     found: dict[str, float] = {}
     for part in (50, 95):
-        own, other = np.percentile(pairs or np.full((1, 2, 2), np.nan), part, axis=0)
-        found |= {f"turn{part}": float(own[0] / other[0]), f"move{part}": float(own[1] / other[1])}
+        own, other = np.percentile(pairs or np.full((1, 2), np.nan), part, axis=0)
+        found[f"turn{part}"] = float(own / other)
     return found
 
 
-def _second_difference(triple: Sequence[Pose]) -> tuple[float, float]:
-    """rad, m."""
-    a, b, c = triple
-    turn = so3.log(c.rotation @ b.rotation.T) - so3.log(b.rotation @ a.rotation.T)
-    move = a.position - 2.0 * b.position + c.position
-    return float(np.linalg.norm(turn)), float(np.linalg.norm(move))
+def _second_difference(triple: Sequence[Pose]) -> float:
+    """rad."""
+    a, b, c = (one.rotation for one in triple)
+    return float(np.linalg.norm(so3.log(c @ b.T) - so3.log(b @ a.T)))
 
 
 def _twists(clip: Clip, poses: Poses, peer: Poses, readout_time: float) -> dict[str, float]:
     """Turn rates against a peer's poses of the neighbours, and the share inside 95 % regions."""
-    errors, rates, inside = [], [], []
+    inside = []
     for k in range(1, len(poses) - 1):
         before, here, after = peer[k - 1], poses[k], peer[k + 1]
         seconds = 1e-9 * (clip.images[k + 1].stamp_ns - clip.images[k - 1].stamp_ns)
@@ -131,20 +128,14 @@ def _twists(clip: Clip, poses: Poses, peer: Poses, readout_time: float) -> dict[
         of_rate = (before.turn_covariance + after.turn_covariance) / seconds**2
         spread = here.covariance[ANGULAR, ANGULAR] / readout_time**2 + of_rate
         inside.append(error @ np.linalg.solve(spread, error) < _INSIDE_3)
-        errors.append(np.linalg.norm(error))
-        rates.append(np.linalg.norm(rate))
-    if not errors:
+    if not inside:
         return {}
-    return {
-        "twist_error": float(np.degrees(np.median(errors))),
-        "twist_size": float(np.degrees(np.median(rates))),
-        "twist_inside": float(np.mean(inside)),
-    }
+    return {"twist_inside": float(np.mean(inside))}
 
 
 def _halves(camera: Camera, images: Sequence[ImagePoints], config: NodeConfig) -> dict[str, float]:
     """Poses of one half of the corners against those of the other, and what each says of the
-    other's corners: rolling over global shutter, the direction of the scan, and the reversed one.
+    other's corners: rolling over global shutter.
 
     Poses are of the two sides of the board: random halves share its bend. Corners are held out by
     random halves.
@@ -154,17 +145,12 @@ def _halves(camera: Camera, images: Sequence[ImagePoints], config: NodeConfig) -
         sides = [localized(name, camera, part, config) for part in _parts(images, _sides)]
         row |= {f"{name}_{key}": x for key, x in _agreement(*sides).items()}
     parts = _parts(images, lambda image, seed: halved(len(image.points), seed))
-    reverse = replace(camera, scan_direction=str(REVERSED[ScanDirection(camera.scan_direction)]))
-    cameras = {"single": camera, "tracked": camera, "reversed": reverse, PEER: camera}
-    fits = {
-        name: localized("tracked" if name == "reversed" else name, by, parts[0], config)
-        for name, by in cameras.items()
+    errors = {
+        name: _errors(camera, localized(name, camera, parts[0], config), parts[1])
+        for name in ("single", "tracked", PEER)
     }
-    errors = {name: _errors(by, fits[name], parts[1]) for name, by in cameras.items()}
-    for name in ("single", "tracked", "reversed"):
+    for name in ("single", "tracked"):
         row[f"{name}_held"] = _ratio(errors[name], errors[PEER])
-    row["tracked_over_single"] = _ratio(errors["tracked"], errors["single"])
-    row["held_px"] = float(np.sqrt(np.nanmean(errors[PEER])))
     return row
 
 
@@ -191,7 +177,7 @@ def _agreement(ones: Poses, others: Poses) -> dict[str, float]:
     Poses are compared at the same motion: what the prior says of the velocities is the same
     in both, and would be a part of both regions and of no difference.
     """
-    inside, turns, moves = [], [], []
+    inside, turns = [], []
     for one, other in zip(ones, others, strict=True):
         if not (isinstance(one, Estimate) and isinstance(other, Estimate)):
             continue
@@ -207,14 +193,12 @@ def _agreement(ones: Poses, others: Poses) -> dict[str, float]:
         spread = first + second
         inside.append(step @ np.linalg.solve(spread, step) < _INSIDE)
         turns.append(step[:3] @ np.linalg.solve(spread[:3, :3], step[:3]))
-        moves.append(step[3:] @ np.linalg.solve(spread[3:, 3:], step[3:]))
     if not inside:
         return {"halves": 0}
     return {
         "halves": len(inside),
         "inside": float(np.mean(inside)),
         "turn_claimed": math.sqrt(_MEDIAN / np.median(turns)),
-        "move_claimed": math.sqrt(_MEDIAN / np.median(moves)),
     }
 
 

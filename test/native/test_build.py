@@ -80,23 +80,6 @@ def test_a_numba_that_was_not_tried_is_refused_with_what_to_type(monkeypatch, ve
             build.check_numba()
 
 
-@pytest.mark.parametrize("missing", ["gcc", "g++"])
-def test_without_a_compiler_it_says_what_to_type(monkeypatch, missing):
-    for name in ("CC", "CXX"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(build.shutil, "which", lambda name: None if name == missing else name)
-    monkeypatch.setattr(build.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(build.CannotBuild, match=r"apt install g\+\+, or pip install ziglang"):
-        build._Compiler(platform.machine(), False)
-
-
-def test_without_eigen_it_says_what_to_type(monkeypatch):
-    monkeypatch.setattr(build.sys, "path", [])
-    monkeypatch.setattr(build.Path, "is_file", lambda path: False)
-    with pytest.raises(build.CannotBuild, match="pip install cmeel-eigen"):
-        build.eigen()
-
-
 def made(folder, tmp_path, seed):
     """Kernels of two modules, from a checkout in a folder, built by a process of that seed."""
     shutil.copytree(sources.PACKAGE, folder / "rs_localizer", ignore=shutil.ignore_patterns("*.so"))

@@ -3,13 +3,10 @@
 """Entries: what Python may call a kernel with, and what becomes of the answer."""
 
 import gc
-import multiprocessing
 import os
 import pickle
-import resource
 import subprocess
 import sys
-import threading
 import typing
 
 import numpy as np
@@ -123,27 +120,6 @@ def test_a_read_only_array_is_taken_where_nothing_is_written():
     np.testing.assert_array_equal(so3.exp(vector), expected)
 
 
-def test_results_are_arrays_of_their_own():
-    first = so3.exp(np.zeros(3))
-    kept = first.copy()
-    for _ in range(100):
-        so3.exp(np.ones(3))
-    np.testing.assert_array_equal(first, kept)
-    assert first.flags.owndata or JITTED
-    assert first.flags.writeable
-
-
-def test_memory_does_not_grow():
-    vectors = np.zeros((1000, 3))
-    for _ in range(100):
-        so3._exp_many(vectors)
-    gc.collect()
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    for _ in range(10_000):
-        so3._exp_many(vectors)  # 72 kB each
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < before + 4_000
-
-
 def test_refusals_do_not_leak():
     held = np.zeros(3, np.float32)
     before = sys.getrefcount(held)
@@ -152,26 +128,6 @@ def test_refusals_do_not_leak():
             so3.exp(held)
     gc.collect()
     assert sys.getrefcount(held) == before
-
-
-def test_two_threads_get_the_same():
-    vectors = np.random.default_rng(1).normal(size=(2000, 3))
-    expected, found = so3._exp_many(vectors), []
-    threads = [
-        threading.Thread(target=lambda: found.append(so3._exp_many(vectors))) for _ in range(4)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert all(np.array_equal(each, expected) for each in found)
-
-
-@pytest.mark.parametrize("how", ["fork", "spawn"])
-def test_other_processes_get_the_same(how):
-    with multiprocessing.get_context(how).Pool(1) as pool:
-        found = pool.apply(so3.exp, (np.array([0.1, 0.2, 0.3]),))
-    np.testing.assert_array_equal(found, so3.exp(np.array([0.1, 0.2, 0.3])))
 
 
 @pytest.mark.skipif(JITTED, reason="of the native module")
