@@ -35,16 +35,14 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, Array1, Array2, Array3
 from rs_localizer.core.rotation_prior import RotationPrior
 from rs_localizer.core.shake import MIDDLE_RATES, MIDDLE_VALUES
-from rs_localizer.core.shutter import Motion, carried
+from rs_localizer.core.shutter import Motion, carried, motion_of
 from rs_localizer.core.state import (
     ANGULAR,
     PARAMETERS,
+    POSE_SIZE,
     STATE_ANGULAR,
     STATE_ANGULAR_ACCELERATION,
-    STATE_LINEAR,
-    STATE_LINEAR_ACCELERATION,
     STATE_SIZE,
-    STATE_TRANSLATION,
     TURN,
     rotation_of,
     step_between,
@@ -95,11 +93,7 @@ class Gaussian(NamedTuple):
         """Return the motion and its covariance, per readout of ``span`` s."""
         units, state = span**_ORDERS, self.state.copy()
         state[12:] *= units[6:]
-        motion = Motion(
-            rotation_of(state).copy(), state[STATE_TRANSLATION], state[STATE_ANGULAR],
-            state[STATE_LINEAR], angular_acceleration=state[STATE_ANGULAR_ACCELERATION],
-            linear_acceleration=state[STATE_LINEAR_ACCELERATION],
-        )  # fmt: skip
+        motion = motion_of((rotation_of(state), *state[POSE_SIZE - 3 :].reshape(5, 3)))
         return motion, self.covariance * np.outer(units, units)
 
 
@@ -413,21 +407,15 @@ def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array, Array]:
     """
     shake, joint = estimate.shake, estimate.joint_covariance
     swing, jacobian = np.zeros((PARAMETERS, PARAMETERS)), _UNSHAKEN[:, : len(joint)]
+    numbers = _numbers(estimate)
     if not len(shake) and len(joint) == PARAMETERS:
-        still = Motion(
-            estimate.rotation, estimate.translation, estimate.angular_velocity,
-            estimate.linear_velocity, angular_acceleration=estimate.angular_acceleration,
-            linear_acceleration=estimate.linear_acceleration,
-        )  # fmt: skip
-        return still, joint, swing, jacobian
+        return Motion(**numbers), joint, swing, jacobian
     values, rates = MIDDLE_VALUES[: len(shake)], MIDDLE_RATES[: len(shake)]
     turned = so3.exp(values @ shake)
-    still = Motion(
-        turned @ estimate.rotation, turned @ estimate.translation,
-        estimate.angular_velocity - rates @ shake, estimate.linear_velocity,
-        angular_acceleration=estimate.angular_acceleration,
-        linear_acceleration=estimate.linear_acceleration,
-    )  # fmt: skip
+    still = Motion(**numbers | {
+        "rotation": turned @ estimate.rotation, "translation": turned @ estimate.translation,
+        "angular_velocity": estimate.angular_velocity - rates @ shake,
+    })  # fmt: skip
     squares = np.square(shake).sum(axis=1) / 3.0
     swing[TURN, TURN] = (values**2 @ squares) * np.eye(3)
     swing[ANGULAR, ANGULAR] = (rates**2 @ squares) * np.eye(3)
