@@ -20,7 +20,6 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Rig, RigEstimate
 from rs_localizer.core.rotation_prior import RotationPrior
-from rs_localizer.core.state import POSE
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.acceptance import (
     estimate_of,
@@ -56,7 +55,6 @@ from rs_localizer.estimation.prior import (
     assumptions,
     of_frame,
     state_in,
-    unchecked,
     with_motion,
 )
 from rs_localizer.estimation.robust import GATE, WIDEST_GATE, best_motion
@@ -302,7 +300,7 @@ class Localizer:
         # 4. Maximum a posteriori on the inliers; rest or motion; the leans of a plane.
         posterior = self._settle(observed, best, observed.terms)
         # 5. Nothing rather than a wrong pose.
-        return self._accept(observed, best, posterior, observed.terms)
+        return self._accept(observed, best, posterior)
 
     def _track(self, observed: Observed, prior: Prior, expected_share: float) -> Estimate | Failure:
         """Find the motion nearest to the prior one, if the points agree with it."""
@@ -314,7 +312,7 @@ class Localizer:
         )
         best = self._search.optimize(observed, predicted, _PREDICTION_SCALE * threshold, terms)
         posterior = self._settle(observed, best, terms)
-        result = self._accept(observed, best, posterior, self._own_terms(observed, prior))
+        result = self._accept(observed, best, posterior, tracked=True)
         if result and np.count_nonzero(result.inliers) < (
             _STILL_TRACKED * expected_share * observed.observations.count
         ):
@@ -402,31 +400,16 @@ class Localizer:
         focal = observed.assumed.focal_length
         return math.hypot(threshold, _MAP_GATE * deviation * focal / max(depth, NEAREST))
 
-    def _own_terms(self, observed: Observed, prior: Prior) -> PriorTerms:
-        """Return the prior of a frame from itself and from the velocities of earlier frames.
-
-        Poses of earlier frames, and so the predicted one, have the calibration error of this frame.
-        """
-        if prior.covariance is None:
-            return observed.terms
-        covariance = np.array(prior.covariance, float)
-        covariance[POSE] = covariance[:, POSE] = 0.0
-        np.fill_diagonal(covariance[POSE, POSE], np.inf)
-        of_velocities = unchecked(prior, covariance=covariance)
-        turned = observed.sighted.rotation is not None
-        return with_motion(observed.terms, of_velocities, observed.centre, turned)
-
     def _accept(
-        self, observed: Observed, best: Candidate, posterior: Posterior, own_terms: PriorTerms
+        self, observed: Observed, best: Candidate, posterior: Posterior, tracked: bool = False
     ) -> Estimate | Failure:
         """Accept the motion or say what is wrong with it."""
         effect = NO_EFFECT
         enough = np.count_nonzero(posterior.inliers) >= self.config.min_inliers
         if enough and posterior.determined and np.all(np.isfinite(posterior.state)):
             effect = calibration_effect(
-                observed, posterior, own_terms, self.config.calibration,
-                own_terms is not observed.terms, observed.error_modes,
-            )  # fmt: skip
+                observed, posterior, self.config.calibration, tracked, observed.error_modes
+            )
         posterior = posterior._replace(
             declared=math.hypot(posterior.declared, effect.residual),  # px, of map and calibration
             speeding=speeding(observed, posterior.state),
@@ -443,11 +426,9 @@ class Localizer:
         odd = LeftOut()
         if self._solver.rolling_shutter:  # a global shutter leaves out rows of one that moves
             gate = self._gate(observed, posterior.state)
-            known = own_terms is not observed.terms
-            odd = left_out(self._search, observed, posterior, gate, known=known)
+            odd = left_out(self._search, observed, posterior, gate, known=tracked)
         if odd.failure is not None:
             return odd.failure
-        predicted = own_terms is not observed.terms
         effect = widened(effect, posterior)
-        estimate = estimate_of(observed, posterior, best.samples, effect, predicted)
+        estimate = estimate_of(observed, posterior, best.samples, effect, tracked)
         return replace(estimate, left_out=odd.notice) if odd.notice else estimate

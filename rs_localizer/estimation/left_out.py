@@ -37,8 +37,9 @@ from rs_localizer.estimation.robust import (
 )
 from rs_localizer.estimation.search import GLOBAL_SHUTTER_SCALE, MotionSearch
 
-# Six points have a motion whatever they are; the corners of one marker may be misplaced in the map.
-_SAMPLE, _MARKER = 6, 4
+# So many points have a motion, or a pose, whatever they are; the corners of one marker may be
+# misplaced in the map.
+_SAMPLE, _OF_POSE, _MARKER = 6, 3, 4
 # Explanations that chance makes in one frame of 1,000 (Desolneux, Moisan and Morel, IJCV 2000: the
 # number of false alarms).
 _LEAST_CHANCE = -math.log(1e-3)
@@ -208,14 +209,19 @@ def _own_motion(
     search: MotionSearch, observed: Observed, rest: BoolArray, threshold: float
 ) -> _Group | None:
     """Return the motion that more left-out points share than chance makes, or None."""
-    own = search.among(observed, rest, _SAMPLE)
-    if not own.found:
-        return None
     observations, gate = observed.observations, WIDEST_GATE * threshold
+    part = replace(
+        observed, observations=observations.only(np.flatnonzero(rest)), ranking=observed.ranking[:0]
+    )
+    left, area = int(np.count_nonzero(rest)), _area(observed)
+    start, circle = search.rough(part), GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length
+    near = int(np.count_nonzero(part.observations.within(start.state, circle)))
+    if _surprise(left, near, _OF_POSE, math.pi * circle**2 / area) < _LEAST_CHANCE:
+        return None
+    own = search.from_rough(part, start)
     group = rest & observations.within(own.state, gate)
-    size, left = int(np.count_nonzero(group)), int(np.count_nonzero(rest))
-    chance = math.pi * gate**2 / _area(observed)
-    if _surprise(left, size, _SAMPLE, chance) < _LEAST_CHANCE:
+    size = int(np.count_nonzero(group))
+    if _surprise(left, size, _SAMPLE, math.pi * gate**2 / area) < _LEAST_CHANCE:
         return None
     part = observations.only(np.flatnonzero(group))
     best = best_motion(part.packed, part.count, own.state, observed.terms, threshold)

@@ -9,7 +9,6 @@ sure. It knows a solver only as a function that turns samples into models.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -389,7 +388,6 @@ class MotionSearch:
         self._optimizes = config.refinement != RefinementKind.NONE
         expected = self._noise, config.solver_iterations
         wide = max(GLOBAL_SHUTTER_SCALE * focal_length, threshold)
-        self._rough = wide
         score = (SCORE_SCALE if self._optimizes else 1.0) * threshold
         scales = (wide, wide) if solver.rolling_shutter else (score, threshold)
         self._starts = Hypotheses(
@@ -407,23 +405,13 @@ class MotionSearch:
         start = self._global_shutter(observed, min(_FEW_SAMPLES, most))
         return self._motion(observed, start, most)
 
-    def among(self, observed: Observed, chosen: BoolArray, least: int) -> Candidate:
-        """Find the motion of these points alone, if more than so many roughly share a pose."""
-        part = replace(
-            observed, observations=observed.observations.only(np.flatnonzero(chosen)),
-            ranking=observed.ranking[:0],
-        )  # fmt: skip
-        start = self.rough(part)
-        if (
-            not start.found
-            or np.count_nonzero(part.observations.within(start.state, self._rough)) <= least
-        ):
-            return NOTHING
-        return self._motion(part, start, _FEW_SAMPLES)
-
     def rough(self, observed: Observed) -> Candidate:
         """Find a pose that fits all rows of enough points roughly, or nothing."""
         return self._global_shutter(observed, _START_SAMPLES)
+
+    def from_rough(self, observed: Observed, start: Candidate) -> Candidate:
+        """Find the motion of most points near a rough pose, by few samples."""
+        return self._motion(observed, start, _FEW_SAMPLES)
 
     def _global_shutter(self, observed: Observed, most: int) -> Candidate:
         """Find a pose that fits all rows roughly, with a wide threshold."""
