@@ -78,7 +78,9 @@ def run(args: Options) -> None:
     with tqdm(total=len(clouds), unit="image", desc="localize", disable=None) as bar:
         localized = from_recording(camera, clouds, landmarks, bar.update)
     deviations = _deviations(args, localized.landmarks, config.map_deviation)
-    freedom = MapFreedom(not config.readout_time > 0.0, args.intrinsics, deviations)
+    freedom = MapFreedom(
+        readout_time=not config.readout_time > 0.0, lens=args.intrinsics, deviations=deviations
+    )
     refined = refine(
         camera, localized.seen, localized.start, freedom, stamp_offset=config.stamp_offset,
         done=_step,

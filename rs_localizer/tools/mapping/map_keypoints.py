@@ -19,7 +19,9 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.maps.landmarks import Map, make_map
 from rs_localizer.tools.adjust.observe import ImagePoints, localize_each
+from rs_localizer.tools.adjust.variables import Freedom
 from rs_localizer.tools.mapping.gauge import Similarity
+from rs_localizer.tools.mapping.initial_trajectory import ANGULAR_VELOCITY, LINEAR_VELOCITY
 from rs_localizer.tools.readout_belief import ReadoutCheck
 
 # A part of the map hangs together with another by at least this many landmarks.
@@ -94,16 +96,15 @@ class Start:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MapFreedom:
+class MapFreedom(Freedom):
     """Unknowns beside landmarks and motion, and their priors."""
 
     readout_time: bool = False
-    lens: bool = False
-    deviations: Array | None = None  # (p,) m, of the landmarks; infinite: not known at all
     angular_acceleration: float = 20.0  # rad/s^2, of the motion at first
     linear_acceleration: float = 10.0  # m/s^2
-    # Standard deviations of the lens: focal lengths and centre by focal length, distortion.
-    lens_deviations: tuple[float, float] = (0.02, 0.1)
+    angular_velocity: float = ANGULAR_VELOCITY
+    linear_velocity: float = LINEAR_VELOCITY
+    deviations: Array | None = None  # (p,) m, of the landmarks; infinite: not known at all
     apart: bool = False  # nothing is known of the motion between images, of a global shutter
     drifts: int = 0  # how many of the errors that landmarks share are asked for
 

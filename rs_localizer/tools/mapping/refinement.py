@@ -34,8 +34,6 @@ from rs_localizer.tools.adjust.variables import (
 )
 from rs_localizer.tools.mapping.gauge import Similarity, as_held, generators, laid_over, scaled
 from rs_localizer.tools.mapping.initial_trajectory import (
-    ANGULAR_VELOCITY,
-    LINEAR_VELOCITY,
     acceleration_prior,
     following,
     initial_trajectory,
@@ -103,15 +101,7 @@ class Refinement:
             trusted=np.ones(len(images), np.bool_),
         )
         self.state = start_state(camera, self.seen, self.spline, camera.readout_time)
-        self.freedom = Freedom(
-            readout_time=freedom.readout_time,
-            lens=freedom.lens,
-            lens_deviations=freedom.lens_deviations,
-            angular_acceleration=freedom.angular_acceleration,
-            linear_acceleration=freedom.linear_acceleration,
-            angular_velocity=ANGULAR_VELOCITY,
-            linear_velocity=LINEAR_VELOCITY,
-        )
+        self.freedom: Freedom = freedom
 
     def _known(self) -> tuple[Array, bool]:
         """Return deviations (p,) of the landmarks, m, and whether nothing holds the whole."""
