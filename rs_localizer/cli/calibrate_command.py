@@ -40,11 +40,7 @@ if WORKING:
     from rs_localizer.offline.detect import seen_by
     from rs_localizer.offline.fleet import Figures
     from rs_localizer.offline.image_sources import Carried, Shot
-    from rs_localizer.offline.recordings import (
-        optical_frame,
-        read_imu_recording,
-        read_recording,
-    )
+    from rs_localizer.offline.recordings import optical_frame, read_imu_recording, read_recording
     from rs_localizer.offline.replay import find_topics, has_frames
     from rs_localizer.pipeline.marker_detector import FrameDetector
     from rs_localizer.pipeline.what_fits import ids_of, mistake_of

@@ -29,12 +29,7 @@ from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.row_kernels import EXTRINSICS
 from rs_localizer.tools.adjust.spline import Spline, refined
 from rs_localizer.tools.adjust.system import Undetermined
-from rs_localizer.tools.adjust.variables import (
-    CameraView,
-    Extrinsics,
-    Freedom,
-    Unknowns,
-)
+from rs_localizer.tools.adjust.variables import CameraView, Extrinsics, Freedom, Unknowns
 from rs_localizer.tools.camera_calibration import CameraCalibration, cut
 from rs_localizer.tools.imu_mount import middle_row
 from rs_localizer.tools.readout_belief import disagreement, discrepancy

@@ -13,11 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.markers.boards import flat_misfit
 from rs_localizer.markers.families import FAMILIES, family
-from rs_localizer.markers.map_files import (
-    read_any,
-    read_marker_map,
-    write_marker_map,
-)
+from rs_localizer.markers.map_files import read_any, read_marker_map, write_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError, other_units, wall
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Charuco, Chessboard, Marker

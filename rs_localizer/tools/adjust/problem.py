@@ -19,14 +19,7 @@ from rs_localizer.tools.adjust.priors import Floating, block_rows, known
 from rs_localizer.tools.adjust.reprojection import LIMIT, Reprojection
 from rs_localizer.tools.adjust.row_kernels import EXTRINSICS, Curve, Projections
 from rs_localizer.tools.adjust.spline_kernels import CONTROL
-from rs_localizer.tools.adjust.system import (
-    Factored,
-    Groups,
-    Quadratic,
-    Rows,
-    System,
-    Undetermined,
-)
+from rs_localizer.tools.adjust.system import Factored, Groups, Quadratic, Rows, System, Undetermined
 from rs_localizer.tools.adjust.variables import MOUNT, CameraView, Unknowns
 
 # Errors beyond this many standard deviations do not count for the scale of the noise.

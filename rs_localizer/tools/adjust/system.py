@@ -20,13 +20,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import (
-    cho_factor,
-    cho_solve,
-    cho_solve_banded,
-    cholesky_banded,
-    solve_triangular,
-)
+from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solve_triangular
 from scipy.linalg.blas import dtrmv
 from scipy.linalg.lapack import dpotri
 from scipy.sparse import bsr_array, csc_array, csr_array, vstack

@@ -32,11 +32,7 @@ from rs_localizer.tools.mapping.anchors import (
     placement,
 )
 from rs_localizer.tools.mapping.gauge import Similarity, laid_on_held, scaled
-from rs_localizer.tools.mapping.map_keypoints import (
-    MapObservations,
-    Start,
-    adjusted_part,
-)
+from rs_localizer.tools.mapping.map_keypoints import MapObservations, Start, adjusted_part
 from rs_localizer.tools.mapping.refinement import DRIFT, RefinedMap
 from rs_localizer.tools.mapping.seen_images import (
     LEAST_VIEWS,

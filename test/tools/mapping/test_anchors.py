@@ -8,12 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.tools.mapping import MappingError
-from rs_localizer.tools.mapping.anchors import (
-    Anchors,
-    Distance,
-    PointSight,
-    placement,
-)
+from rs_localizer.tools.mapping.anchors import Anchors, Distance, PointSight, placement
 from rs_localizer.tools.mapping.gauge import Similarity
 from rs_localizer.tools.mapping.triangulation import Triangulated
 

@@ -7,12 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from dense import normal_of
-from scenes import (
-    READOUT,
-    Walk,
-    camera,
-    walk,
-)
+from scenes import READOUT, Walk, camera, walk
 from scipy.linalg import eigh
 
 from rs_localizer.core.scanning import ScanDirection
@@ -21,12 +16,7 @@ from rs_localizer.tools.adjust.system import Factored
 from rs_localizer.tools.adjust.variables import Freedom, Unknowns
 from rs_localizer.tools.mapping.gauge import through
 from rs_localizer.tools.mapping.map_keypoints import MapFreedom, MapObservations
-from rs_localizer.tools.mapping.refinement import (
-    DRIFT,
-    RefinedMap,
-    Refinement,
-    refine,
-)
+from rs_localizer.tools.mapping.refinement import DRIFT, RefinedMap, Refinement, refine
 
 VIDEO = np.arange(0.0, 1.2, 1.0 / 30.0)
 

@@ -6,12 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import (
-    READOUT,
-    camera,
-    ring,
-    spot,
-)
+from scenes import READOUT, camera, ring, spot
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.io.transforms import Transform
