@@ -42,8 +42,6 @@ def test_a_model_of_colmap_becomes_a_file(tmp_path, capsys):
     said = capsys.readouterr().out
     assert f"written: {out}" in said
     assert read_map_file(out, "map").equals(read_map_file(COLMAP / "binary", "map"))
-    assert main(words) == 1
-    assert "exists; choose another OUT, or --overwrite" in capsys.readouterr().err
     assert main([*words, "--overwrite", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)["result"]
     assert result["landmarks"] == len(read_map_file(out, "map"))
@@ -59,10 +57,7 @@ def marker_file(tmp_path) -> Path:
     return path
 
 
-def test_info_and_convert(tmp_path, marker_file, capsys):
-    assert main(["map", "info", str(marker_file)]) == 0
-    said = capsys.readouterr().out
-    assert re.search(r"ids_apriltag_36h11 +\[0, 1, 2, 3, 4, 5\]\n", said)
+def test_markers_become_landmarks(tmp_path, marker_file):
     corners = tmp_path / "corners.npz"
     assert main(["map", "align", str(marker_file), str(corners)]) == 0
     landmarks = read_map_file(corners, "map")
@@ -84,9 +79,6 @@ def test_make_and_check(tmp_path, capsys):
     assert main(["map", "info", f"{out}.yaml"]) == 0
     said = capsys.readouterr().out
     assert re.search(r"ids_4x4_50 +\[0, 1, 2, 3, 4, 5\]\n", said)
-    # Nothing is overwritten.
-    assert make(out, "--size", "0.05") == 1
-    assert "exists; choose another OUT, or --overwrite" in capsys.readouterr().err
     assert make(out, "--size", "0.05", "--overwrite", "--json") == 0
     pages = {"pages": [f"{out}.pdf"], "map": f"{out}.yaml", "corners": 24}
     assert json.loads(capsys.readouterr().out)["result"] == pages
