@@ -26,6 +26,12 @@ _CARPET, _LEAST, _MOST = (np.repeat(np.square(pair), 3) for pair in (
 # counts by a fifth, so that some twenty seconds do.
 _BASELINE, _NEWEST = 2.0, 0.2
 
+# s of agreement from which on a hypothesis is told as a contradiction; what a pose adds at most.
+PERSISTS, _STEP = 0.2, 0.2
+# What is hit slides to rest by friction: at most this far per squared second, half of 1 g (m), and
+# as far for the edge of a body of 0.2 m (rad).
+_SLIDE = 4.9, 25.0
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Odometry:
@@ -100,6 +106,10 @@ class CarriedPose:
     def body(self, now: Odometry) -> Transform:
         """Return ``map_from_body`` at another moment."""
         return self.map_from_odom @ now.odom_from_body
+
+    def staying(self, since: Odometry, now: Odometry) -> "CarriedPose":
+        """Return the pose of a body that has stayed where it was, whatever odometry says."""
+        return replace(self, map_from_odom=self.body(since) @ now.odom_from_body.inverse())
 
     def seconds(self, now: Odometry) -> float:
         return max(1e-9 * (now.stamp_ns - self.since.stamp_ns), 0.0)
@@ -176,6 +186,75 @@ def corrected(map_from_body: Transform, odom_from_body: Transform, *, two_d: boo
     rotation = so3.exp(np.array([0.0, 0.0, yaw]))
     translation = map_from_body.translation - rotation @ odom_from_body.translation
     return Transform(rotation, translation * np.array([1.0, 1.0, 0.0]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypothesis:
+    """A pose that may be right.
+
+    Poses of a track err together: many are no better than the sharpest of them. That one stays
+    until drift makes it less certain than the newest, which tells how certain it is.
+    """
+
+    pose: CarriedPose
+    newest: CarriedPose
+    near_ns: int  # of the last pose there, be it as doubtful as it may
+    seen_ns: float = -math.inf  # of the last pose of a frame that counted
+    support: float = 0.0  # s for which poses agreed
+    reachable: bool = True  # whether a body can have come there
+    # The first pose there (of what is held: the last but one), and when poses left the held one
+    earlier: CarriedPose | None = None
+    left_ns: int = 0
+
+    @property
+    def told(self) -> bool:
+        """Whether poses agreed for long enough to speak of it."""
+        return self.support >= PERSISTS
+
+    def renewed(
+        self, found: "Hypothesis", drift: Drift, axes: list[int], most: float
+    ) -> "Hypothesis":
+        """Return this one with its newest pose, and a support of at most so many seconds."""
+        now = found.pose.since
+        since = max(1e-9 * (found.near_ns - self.near_ns), 0.0)
+        return replace(
+            self, pose=self.pose.sharper(found.pose, now, drift, axes), newest=found.newest,
+            near_ns=found.near_ns, seen_ns=found.seen_ns,
+            support=min(self.support + min(since, _STEP), most),
+        )  # fmt: skip
+
+    def stepped(self, held: "Hypothesis") -> bool:
+        """Return whether poses came here in a step that no body makes, be odometry wrong or not.
+
+        What is carried moves before or after its longest step; what is hit slides on.
+        """
+        left, first, end = held.newest, self.earlier or self.pose, self.pose
+        before, at = held.earlier or left, first.since
+        seconds = 1e-9 * max(at.stamp_ns - self.left_ns, 0)
+        drove = left.body(left.since).translation - before.body(before.since).translation
+        drove *= seconds / max(before.seconds(left.since), 1e-3)
+
+        def from_rest(start: CarriedPose, more: float) -> bool:
+            steps = start.offset(end, at)
+            return any(
+                _surely(start, end, at, steps[part], part, most * seconds**2 + more, 3.0)
+                and not _surely(before, left, left.since, steps[part], part)
+                and not _surely(first, end, at, steps[part], part)
+                for part, most in zip((PLACE, TURN), _SLIDE, strict=True)
+            )
+
+        stayed = left.staying(left.since, at)
+        return from_rest(left, 0.0) and from_rest(stayed, float(np.linalg.norm(drove)))
+
+
+def _surely(
+    one: CarriedPose, other: CarriedPose, at: Odometry, way: Array, part: slice,
+    most: float = 0.0, deviations: float = 2.0,
+) -> bool:  # fmt: skip
+    """Return whether two poses lie farther apart along a way (3,) than ``most``, but for noise."""
+    along = way / max(float(np.linalg.norm(way)), 1e-12)
+    spread = float(along @ (one.covariance + other.covariance)[part, part] @ along)
+    return float(one.offset(other, at)[part] @ along) > most + deviations * math.sqrt(spread)
 
 
 def _moved(covariance: Array, way: Array) -> Array:

@@ -11,9 +11,9 @@ a chi-squared gate. One that does not is kept aside as a second hypothesis, and 
   or the first hypothesis never had a second of poses itself.
 
 A wrong map agrees with itself as well as a right one. But its poses jump from one image to the
-next, which no body does, and are not believed however long they last. A click is a measurement. A
-refusal changes nothing of what is held; no acceptance makes drift larger than any odometry's, or
-opens the gate to less certain poses.
+next, from rest to rest, which no body does, and are not believed however long they last. A click is
+a measurement. A refusal changes nothing of what is held; no acceptance makes drift larger than any
+odometry's, or opens the gate to less certain poses.
 """
 
 import math
@@ -26,12 +26,14 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.integrity import MOST_JUMP
 from rs_localizer.io.transforms import Transform
 from rs_localizer.pipeline.carried_pose import (
+    PERSISTS,
     PLACE,
     TURN,
     CarriedPose,
     Click,
     Drift,
     FoundPose,
+    Hypothesis,
     Odometry,
     carried_pose,
     far,
@@ -41,14 +43,13 @@ from rs_localizer.pipeline.carried_pose import (
 # Chi-squared, 99.99 %: of x, y and heading, and of six numbers. By chance a camera of 30 Hz has ten
 # poses an hour refused, one at a time, while odometry carries on what is held.
 _GATES = {3: 21.1, 6: 27.9}
-_DOUBTFUL = 0.5  # a pose that is more probably wrong than right is no evidence
 _CLEARLY = 9.0  # twice the logarithm of ninety to one, against the hypothesis that has more poses
 # A person who carries a robot walks (m/s) and turns (rad/s) at most this fast. Faster motion has to
 # be noise, of at most two deviations.
 _PACE, _SPIN, _SLACK = 1.5, 3.0, 4.0
-# s of agreement that a hypothesis needs to be believed, and to be told as a contradiction; what a
-# pose adds at most; s for which poses of which nothing followed are remembered.
-_AGREES, _PERSISTS, _STEP, _BRIEF = 1.0, 0.2, 0.2, 1.0
+# s of agreement that a hypothesis needs to be believed; s for which poses of which nothing followed
+# are remembered.
+_AGREES, _BRIEF = 1.0, 1.0
 _FRESH = 0.5  # s after a pose until which it is tracking; cameras of 5 Hz may miss one image
 _RESTART = 500_000_000  # ns by which time goes back only if a recording starts over
 
@@ -71,27 +72,6 @@ class Settings:
     def axes(self) -> list[int]:
         """Of the six numbers of a pose, those that it has."""
         return [0, 1, 5] if self.two_d else [0, 1, 2, 3, 4, 5]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Hypothesis:
-    """A pose that may be right.
-
-    Poses of a track err together: many are no better than the sharpest of them. That one stays
-    until drift makes it less certain than the newest, which tells how certain it is.
-    """
-
-    pose: CarriedPose
-    newest: CarriedPose
-    near_ns: int  # of the last pose there, be it as doubtful as it may
-    seen_ns: float = -math.inf  # of the last pose of a frame that counted
-    support: float = 0.0  # s for which poses agreed
-    reachable: bool = True  # whether a body can have come there
-
-    @property
-    def told(self) -> bool:
-        """Whether poses agreed for long enough to speak of it."""
-        return self.support >= _PERSISTS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,7 +141,9 @@ class _Case:
 
     def posed(self, found: Hypothesis, doubt: float) -> tuple[CorrectionState, str]:
         """Return the state after a pose, probably right or not, and the sentence to say."""
-        state, held, aside, right = self.state, self.held, self.aside, not doubt >= _DOUBTFUL
+        state, held, aside = self.state, self.held, self.aside
+        # Whether the track has jumped, odometry tells: a jump alone is no ground for doubt.
+        right = not doubt > MOST_JUMP
         if held is not None and self.now.stamp_ns <= held.newest.since.stamp_ns:
             return state, ""
         if held is None:
@@ -173,18 +155,21 @@ class _Case:
             if not right:
                 return replace(state, held=replace(held, near_ns=self.now.stamp_ns)), ""
             base, drift = state.drift.judged(state.base or found.pose, found.pose, self.now)
-            held = self._renewed(held, found, _AGREES)
+            held = replace(held.renewed(found, *self._drift, _AGREES), earlier=held.newest)
             if aside and (not aside.told or aside.newest.seconds(self.now) > _BRIEF):
                 aside = None
             return replace(state, held=held, aside=aside, base=base, drift=drift), ""
         if aside is None or not self._passes(theirs):
-            if aside and aside.told and aside.newest.seconds(self.now) <= _BRIEF:
-                return state, ""  # one pose elsewhere ends no contradiction
-            found = replace(found, reachable=self._reachable(held, aside, found))
+            if aside and self._stays(aside, found):
+                return state, ""
+            reachable = self._reachable(held, aside, found)
+            left_ns = aside.left_ns if aside and aside.told else held.near_ns
+            found = replace(found, reachable=reachable, left_ns=left_ns, earlier=found.pose)
             return replace(state, aside=found), ""
-        if aside.reachable:  # a jump is no ground for doubt where the body can have made it
-            right = not doubt > MOST_JUMP
-        found = self._renewed(aside, found, _AGREES if right else max(aside.support, _PERSISTS))
+        most = _AGREES if right else max(aside.support, PERSISTS)
+        found = aside.renewed(found, *self._drift, most)
+        if found.told and not aside.told:  # later, odometry has drifted too far to tell
+            found = replace(found, reachable=found.reachable and not found.stepped(held))
         if found.support < _AGREES or not (found.reachable or held.support < _AGREES):
             return replace(state, aside=found), ""
         jump = far(held.pose.offset(found.pose, self.now))
@@ -196,8 +181,7 @@ class _Case:
         state, held = self.state, self.held
         for known, text in ((held, "as a measurement"), (self.aside, "for what contradicts it")):
             if known and known.seen_ns > 0 and self._passes(self._misfit(known, found)):
-                measured = (found.pose, self.now, state.drift, self.settings.axes)
-                pose = known.pose.fused(*measured)
+                pose = known.pose.fused(found.pose, self.now, *self._drift)
                 fused = replace(known, pose=pose, newest=pose, reachable=True)
                 aside, base = (self.aside, state.base) if known is held else (None, None)
                 state = replace(state, held=fused, aside=aside, base=base, refused=None)
@@ -247,8 +231,12 @@ class _Case:
         brief = aside is None or aside.told or aside.newest.seconds(self.now) < _BRIEF
         return aside if brief else None
 
+    @property
+    def _drift(self) -> tuple[Drift, list[int]]:
+        return self.state.drift, self.settings.axes
+
     def _grown(self, pose: CarriedPose) -> Array:
-        return pose.grown(self.now, self.state.drift, self.settings.axes)
+        return pose.grown(self.now, *self._drift)
 
     def _misfit(self, known: Hypothesis | None, found: Hypothesis) -> tuple[float, float]:
         """Return the squared distance in deviations, and -2 log likelihood less 2 pi."""
@@ -270,6 +258,14 @@ class _Case:
     def _passes(self, misfit: tuple[float, float]) -> bool:
         return misfit[0] <= _GATES[len(self.settings.axes)]
 
+    def _stays(self, aside: Hypothesis, found: Hypothesis) -> bool:
+        """Return whether a hypothesis outlasts a pose elsewhere."""
+        since = aside.newest.seconds(self.now)
+        if aside.told:  # one pose ends no contradiction
+            return since <= _BRIEF
+        sharper = aside.pose.sharper(found.pose, self.now, *self._drift)
+        return since <= PERSISTS and sharper is aside.pose
+
     def _reachable(self, held: Hypothesis, aside: Hypothesis | None, found: Hypothesis) -> bool:
         """Return whether a body can have got from the last pose to a new one, despite odometry."""
         gate = _GATES[len(self.settings.axes)]
@@ -280,19 +276,10 @@ class _Case:
     def _near(self, known: Hypothesis, found: Hypothesis, slack: float) -> bool:
         """Return whether a pose is within reach of the known or carried one, but for noise."""
         reach = np.multiply((_PACE, _SPIN), 1e-9 * (self.now.stamp_ns - known.near_ns))
-        stayed = known.pose.body(known.newest.since) @ self.now.odom_from_body.inverse()
-        for start in (known.pose, replace(known.pose, map_from_odom=stayed)):
+        for start in (known.pose, known.pose.staying(known.newest.since, self.now)):
             off = start.offset(found.pose, self.now)
             for part, most in zip((PLACE, TURN), reach, strict=True):
                 off[part] *= max(1.0 - most / max(float(np.linalg.norm(off[part])), 1e-12), 0.0)
             if self._distance(off, self._spread(known, found)) <= slack:
                 return True
         return False
-
-    def _renewed(self, known: Hypothesis, found: Hypothesis, most: float) -> Hypothesis:
-        """Return a hypothesis with its newest pose, and a support of at most so many seconds."""
-        since = max(1e-9 * (self.now.stamp_ns - known.near_ns), 0.0)
-        support = min(known.support + min(since, _STEP), most)
-        measured = found.pose, self.now, self.state.drift, self.settings.axes
-        pose = known.pose.sharper(*measured)
-        return replace(found, pose=pose, support=support, reachable=known.reachable)

@@ -149,6 +149,7 @@ def test_the_correction_never_stops(made, robot, peer):
     peer.spin_until(lambda: node.broadcaster.decision.seconds > 2.35)
     assert str(node.broadcaster.decision).startswith("holding for 2.4 s, ")
     assert node.broadcaster.values["map -> odom"] == "held"
+    assert node.broadcaster.values["Smallest jump that is refused"].endswith(" deg")
     # A frame that contradicts it beyond all drift is kept aside, and room is made for it.
     node.publish(frame(7_800_000_000, x=97.8))
     decision = node.broadcaster.decision
