@@ -63,13 +63,6 @@ def test_rays_come_back_from_their_pixels(model):
         np.testing.assert_allclose(camera.rays(camera.distort(RAYS)[0]), RAYS, atol=1e-6)
 
 
-@pytest.mark.parametrize("model", DistortionModel)
-def test_a_single_image_corrects_the_lowest_powers_only(model):
-    orders = model.law.correctable
-    assert orders[:2] == (0, 1)
-    assert all(order is None or order < 2 for order in orders)
-
-
 def khomutenko(x, y, z, alpha, beta):
     """Equation 12 of the paper."""
     rho = math.sqrt(z * z + beta * (x * x + y * y))

@@ -9,7 +9,6 @@ from scipy.stats import chi2
 
 from rs_localizer.estimation.acceptance import refusal
 from rs_localizer.estimation.hypotheses import frame_posterior
-from rs_localizer.estimation.prior import held_terms
 
 from .frames import ASSUMED, PRIOR, distance, fitted, frame, observe
 from .projection import disturbed, jacobian_of
@@ -20,22 +19,13 @@ def settled(seed, speed, noise=0.5, **more):
     return frame_posterior(observations, truth, PRIOR, 2.0, ASSUMED), truth
 
 
-@pytest.fixture(scope="module", params=[30, pytest.param(60, marks=pytest.mark.bench)])
-def resting(request):
-    """Frames at rest: what is settled, the moving and the resting optimum, and the truth."""
-    found = []
-    for seed in range(request.param):
-        observations, truth = frame(seed, 0.0, 0.5)
-        moving, still = (fitted(observations, truth, terms, 2.0) for terms in (PRIOR, held_terms()))
-        found.append(
-            (frame_posterior(observations, truth, PRIOR, 2.0, ASSUMED), moving, still, truth)
-        )
-    return found
-
-
-def test_at_rest_the_truth_is_covered(resting):
-    poses = np.array([distance(case[0], case[3], slice(0, 6)) for case in resting])
-    twists = np.array([distance(case[0], case[3], slice(6, 12)) for case in resting])
+@pytest.mark.parametrize("frames", [30, pytest.param(60, marks=pytest.mark.bench)])
+def test_at_rest_the_truth_is_covered(frames):
+    resting = [settled(seed, 0.0) for seed in range(frames)]
+    poses, twists = (
+        np.array([distance(*case, part) for case in resting])
+        for part in (slice(0, 6), slice(6, 12))
+    )
     assert np.median(poses) < 6.6  # 5.35 of six parameters
     assert np.mean(poses < chi2.ppf(0.95, 6)) > 0.88
     # The region of the velocities holds zero, and says so of every frame but few.

@@ -115,11 +115,8 @@ def oracle(name, points, rays, tau, rotation, iterations, as_published=False):
     return solve(points, rays, tau, rotation, iterations, as_published)
 
 
-def problem(count, size, turn=0.0, travel=0.0, start_error=0.0, noise=0.0, seed=0, model="exact"):
-    """Samples of points in [-1, 1]^3 seen from 2 to 3 away by a moving camera.
-
-    ``model``: ``exact`` rotations (model A) or the ``double`` linearised one.
-    """
+def problem(count, size, turn=0.0, travel=0.0, start_error=0.0, noise=0.0, seed=0):
+    """Samples of points in [-1, 1]^3 seen from 2 to 3 away by a camera that turns (model A)."""
     rng = np.random.default_rng(seed)
 
     def directions(length):
@@ -134,14 +131,9 @@ def problem(count, size, turn=0.0, travel=0.0, start_error=0.0, noise=0.0, seed=
     start = Rotation.from_rotvec(directions(start_error)).as_matrix() @ rotation
     camera = np.empty((count, size, 3))
     for i in range(count):
-        if model == "exact":
-            turns = Rotation.from_rotvec(tau[i, :, None] * w[i]).as_matrix()
-            camera[i] = np.einsum("nij,nj->ni", turns @ rotation[i], points[i]) + c[i]
-            camera[i] += tau[i, :, None] * t[i]
-        else:
-            v = directions(np.tan(start_error))[0] if start_error else np.zeros(3)
-            rotation[i] = nearest(np.eye(3) + skew(v)) @ start[i]
-            camera[i] = camera_points(points[i] @ start[i].T, tau[i], v, c[i], w[i], t[i])
+        turns = Rotation.from_rotvec(tau[i, :, None] * w[i]).as_matrix()
+        camera[i] = np.einsum("nij,nj->ni", turns @ rotation[i], points[i]) + c[i]
+        camera[i] += tau[i, :, None] * t[i]
     rays = camera[..., :2] / camera[..., 2:] + noise * rng.normal(size=(count, size, 2))
     return SimpleNamespace(
         points=points, rays=rays, tau=tau, rotation=rotation, c=c, w=w, t=t, start=start

@@ -61,9 +61,3 @@ def test_r6p_finds_the_authors_solutions_and_no_others(stored, bound):
         apart = np.abs(found[:, None] - expected).max(axis=2) / (1.0 + np.abs(expected).max(axis=1))
         assert (apart.min(axis=0) < 1e-6).all()
         assert (apart.min(axis=1) < 1e-6).all()
-
-
-def test_a_bound_is_of_r6p_alone(stored):
-    for name, bound in (("r6p_vcwt", 1.0), ("r6p", 0.0), ("r6p", np.nan)):
-        with pytest.raises(ValueError, match=r"bound is that of r6p, above 0"):
-            solved(name, stored, bound=bound)
