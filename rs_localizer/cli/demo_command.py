@@ -8,10 +8,11 @@ import contextlib
 import io
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from rs_localizer.cli import WORKING, detect_command, import_ros, simulate_command, stage
 from rs_localizer.cli.options import option
@@ -46,6 +47,8 @@ _FLIGHT, _WALLS = (8.0, 18.0), (21.366, 3.533)
 _EXPOSURE = 0.001  # s, of a row in a bright room: at 200 deg/s it blurs by 2 px
 _QUICK_FRAMES = 12
 _METHODS = (NodeConfig().solver, "p3p")
+Frame = tuple[int, Any, Any]
+"""Stamp (ns), CameraInfo and cloud."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,14 +58,6 @@ class Options:
     all: bool = option(
         "also walls of markers, rendered and detected, and a live node", default=False
     )
-
-
-class FrameMessages(NamedTuple):
-    """Messages of a frame."""
-
-    stamp_ns: int
-    info: Any  # sensor_msgs/CameraInfo
-    cloud: Any  # sensor_msgs/PointCloud2
 
 
 def run(options: Options) -> None:
@@ -75,8 +70,7 @@ def run(options: Options) -> None:
     with atomic_files(picture) as (part,):
         errors.draw(found, part)
     webcam = data.path(data.WEBCAM)
-    of_webcam = build(load_params_file(webcam / PARAMETERS)).readout_time
-    _localized("Webcam over a board", read_frames(webcam, most), of_webcam, None)
+    _localized("Webcam over a board", *_recorded(webcam, webcam, most), None)
     if options.all:
         _localized("Walls of markers", *_simulated(most, images=True))
         _live(flight, answers[_METHODS[0]], readout_time)
@@ -84,25 +78,19 @@ def run(options: Options) -> None:
     print(f"next: {typed('rs_localizer', 'markers', 'make', 'board', '--help')}")
 
 
-def read_frames(path: Path, most: int | None = None) -> list[FrameMessages]:
-    """Return the frames, or the first ones, of a recording of correspondences.
-
-    Raises:
-        BagError: when it cannot be read.
-    """
-    frames, info = list[FrameMessages](), None
+def _recorded(path: Path, place: Path, most: int | None) -> tuple[list[Frame], float]:
+    """Return the first frames of a recording, and the readout time (s) that stands in a place."""
+    frames, info = list[Frame](), None
     with open_bag(path) as bag:
         for topic, _, message in bag.messages({CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC}):
             if topic == CAMERA_INFO_TOPIC:
                 info = message
             else:
-                frames.append(FrameMessages(stamp_ns(message), info, message))
-    return frames[:most]
+                frames.append((stamp_ns(message), info, message))
+    return frames[:most], build(load_params_file(place / PARAMETERS)).readout_time
 
 
-def _simulated(
-    most: int | None, images: bool = False
-) -> tuple[list[FrameMessages], float, Motions]:
+def _simulated(most: int | None, images: bool = False) -> tuple[list[Frame], float, Motions]:
     """Return frames of a flight, or of rendered walls, the readout time (s), and the truth."""
     start, duration = _WALLS if images else _FLIGHT
     with tempfile.TemporaryDirectory() as place, contextlib.redirect_stdout(io.StringIO()):
@@ -115,15 +103,14 @@ def _simulated(
         if images:
             matches, markers = Path(place) / "matches", made / MARKER_MAP
             detect_command.detect(detect_command.Options(recording=made, map=markers, out=matches))
-        readout_time = build(load_params_file(made / PARAMETERS)).readout_time
-        return read_frames(matches), readout_time, read_motions(made)
+        return *_recorded(matches, made, None), read_motions(made)
 
 
 def _localized(
-    title: str, frames: Sequence[FrameMessages], readout_time: float, true: Motions | None
+    title: str, frames: Sequence[Frame], readout_time: float, true: Motions | None
 ) -> tuple[dict[str, dict[int, Localized]], dict[str, dict[str, errors.Errors]]]:
     """Localize the frames by method as a node does, print medians, and return errors, too."""
-    answers, rows = dict[str, dict[int, Localized]](), dict[str, dict[str, float]]()
+    answers, rows = dict[str, dict[int, Localized]](), defaultdict[str, list[float]](list)
     off = dict[str, dict[str, errors.Errors]]()
     for solver in _METHODS:
         localizer, track = CameraFrames(build(_settings(solver, readout_time))), Track()
@@ -135,17 +122,16 @@ def _localized(
                     found[stamp] = frame
                     track.add(frame)
                 step(1)
-        rows.setdefault("localized (%)", {})[solver] = 100.0 * len(found) / len(frames)
+        rows["localized (%)"].append(100.0 * len(found) / len(frames))
         rms = [frame.estimate.residual_rms for frame in found.values()]
-        rows.setdefault("residual (px rms)", {})[solver] = float(np.median(rms))
+        rows["residual (px rms)"].append(float(np.median(rms)))
         off[solver] = {} if true is None else errors.errors_of(track.motions(), true)
         for kind, each in off[solver].items():
             scale, unit = (1e3, "mm") if errors.UNITS[kind] == "m" else (1.0, errors.UNITS[kind])
-            rows.setdefault(f"{kind} ({unit})", {})[solver] = scale * float(np.median(each.values))
+            rows[f"{kind} ({unit})"].append(scale * float(np.median(each.values)))
     for name, values in rows.items():
-        cells = [f"{values[it]:.3g}" if it in values else "" for it in _METHODS]
         label = f"{title}, {len(frames)} frames: {name}"
-        print(f"{label:56}{cells[0]:>9}{cells[1]:>9}".rstrip(), flush=True)
+        print(f"{label:56}" + "".join(f"{value:9.3g}" for value in values), flush=True)
     return answers, off
 
 
@@ -153,9 +139,7 @@ def _settings(solver: str, readout_time: float) -> dict[str, Any]:
     return {"solver": solver, "readout_time": readout_time, "pose_time": "mid_frame"}
 
 
-def _live(
-    frames: Sequence[FrameMessages], answers: Mapping[int, Localized], readout_time: float
-) -> None:
+def _live(frames: Sequence[Frame], answers: Mapping[int, Localized], readout_time: float) -> None:
     """Localize the flight once more with a live node, and compare."""
     live, late, same = import_ros("live", "a live node"), list[float](), 0
     settings = _settings(_METHODS[0], readout_time)

@@ -34,7 +34,7 @@ if WORKING:
 
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.offline import detect as offline
-    from rs_localizer.offline.detect import Extraction, record, record_features
+    from rs_localizer.offline.detect import Extraction, record_features, record_markers
     from rs_localizer.offline.fleet import Figures
     from rs_localizer.offline.image_sources import Carried, Shot
     from rs_localizer.pipeline.keypoints import FrameExtractor
@@ -154,7 +154,7 @@ def _of_markers(args: Options) -> tuple[Mapping[str, float], Detection]:
     ) -> Extraction:
         notices: Counter[str] = Counter()
         detector = FrameDetector(config, lambda _, text: notices.update([text]), marker_map)
-        found = record(
+        found = record_markers(
             shots, detector, bag, options, done=bar.update,
             tell=lambda text: bar.write(f"note: {text}", file=sys.stderr),
         )  # fmt: skip

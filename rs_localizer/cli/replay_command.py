@@ -35,7 +35,7 @@ if WORKING:
     from rs_localizer.offline import fleet, frame_table
     from rs_localizer.offline.fleet import Figures, Outcome, Task
     from rs_localizer.offline.image_sources import holds_images, image_topics
-    from rs_localizer.offline.replay import has_frames, imu_topics, prepare
+    from rs_localizer.offline.replay import has_frames, imu_topics, prepare_replay
     from rs_localizer.offline.results import Smooth, Tally, figures, summary, write_results
     from rs_localizer.settings import build
 
@@ -176,7 +176,7 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
     if config.of_cameras and options.parquet is not None:
         raise UsageError("--parquet is for one camera: leave it out with cameras")
     with open_bag(path) as bag:
-        topics, localizer = prepare(bag, config, given_topics(options), notice)
+        topics, localizer = prepare_replay(bag, config, given_topics(options), notice)
         unused = IMU not in topics.of and config.imu.use != ImuUse.NONE
         if unused and (several := imu_topics(bag)):
             print(f"no IMU is used: choose {' or '.join(several)} with -r imu:=TOPIC")

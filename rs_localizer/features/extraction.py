@@ -22,7 +22,9 @@ _REACH = _WINDOW = 1
 _MARGIN = _REACH + 1 + _WINDOW + 1
 
 
-def refined(image: NDArray[np.uint8], corners: IntArray, levels: IntArray, step: float) -> Array:
+def refine_corners(
+    image: NDArray[np.uint8], corners: IntArray, levels: IntArray, step: float
+) -> Array:
     """Return the corners (n,2) in pixels of the image, the centre of the first one at 0, 0.
 
     Args:
@@ -178,7 +180,7 @@ def _orb_place(image: Gray, keypoints: Sequence[Any]) -> Array:
     octaves = np.array([keypoint.octave for keypoint in keypoints], np.int64)
     scale = _ORB_STEP**octaves
     corners = np.rint(_points(keypoints) / scale[:, None]).astype(np.int64)
-    return refined(image, corners, octaves, _ORB_STEP)
+    return refine_corners(image, corners, octaves, _ORB_STEP)
 
 
 _METHODS: dict[str, _Method] = {
@@ -192,7 +194,7 @@ _METHODS: dict[str, _Method] = {
 _PER_CELL = 8
 
 
-def balanced(pixels: Array, scores: Array, size: tuple[int, int], most: int) -> IntArray:
+def choose_balanced(pixels: Array, scores: Array, size: tuple[int, int], most: int) -> IntArray:
     """Return rows (k,) of the best keypoints of each cell of a grid, then of the second best ...
 
     Args:
@@ -294,7 +296,9 @@ class FeatureExtractor:
     def _choose(self, detected: Sequence[Any], image: Gray) -> list[int]:
         scores = np.array([keypoint.response for keypoint in detected])
         height, width = image.shape
-        rows: list[int] = balanced(_points(detected), scores, (width, height), self._most).tolist()
+        rows: list[int] = choose_balanced(
+            _points(detected), scores, (width, height), self._most
+        ).tolist()
         return rows
 
 

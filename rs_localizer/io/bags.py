@@ -35,7 +35,7 @@ from rs_localizer.io.containers import (
     ZSTD,
     data_files,
     limit_rosbags,
-    magic,
+    read_magic,
     storage,
     unpack_file,
     unpack_zstd,
@@ -166,7 +166,7 @@ def is_bag(path: Path) -> bool:
     """Return True for a recording, by its content; False for a video or a folder of images."""
     if path.is_dir():
         return (path / METADATA).exists() or bool(data_files(path))
-    return bool(magic(path))
+    return bool(read_magic(path))
 
 
 def _listed(path: Path) -> tuple[list[Path] | None, bool]:
@@ -180,7 +180,7 @@ def _listed(path: Path) -> tuple[list[Path] | None, bool]:
     if not path.is_dir():
         if path.is_file() and path.stat().st_size == 0:
             raise BagError(f"{path} is an empty file")
-        if not path.is_file() or not magic(path):
+        if not path.is_file() or not read_magic(path):
             raise BagError(
                 f"{path} is not a recording: expected a rosbag2 folder, or a file that is an MCAP, "
                 "a database of rosbag2 or a ROS 1 bag by its first bytes"

@@ -19,6 +19,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel
+from rs_localizer.io.camera_info import interpret_lens
 from rs_localizer.io.reading import (
     LENS,
     YamlError,
@@ -34,16 +35,6 @@ _ORDER = {
     "rational_polynomial": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "equidistant": ("k1", "k2", "k3", "k4"),
 }
-_RATIONAL = len(_ORDER["rational_polynomial"])
-# Names of the models in other programs.
-_MODELS = {
-    "fisheye": "equidistant", "opencv_fisheye": "equidistant",
-    "radtan": "plumb_bob", "pinhole": "plumb_bob", "none": "plumb_bob",
-    "opencv_standard": "plumb_bob",
-    "double_sphere": str(DistortionModel.DOUBLE_SPHERE),
-}  # fmt: skip
-
-
 # Names of the parts of a lens in ROS, in OpenCV's programs and in users' files.
 _K = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "mtx")
 _D = (
@@ -194,13 +185,11 @@ def _named_camera(tree: dict[str, Any]) -> Camera | None:
             "without distortion says so: distortion_coefficients: {data: []}"
         )
     width, height = (int(side) for side in _values(size))
-    coefficients = _values(D)
     name = str(_first(tree, ("distortion_model", "camera_model")) or "").lower()
     name = "fisheye" if tree.get("fisheye_model") else name  # of OpenCV's example
-    model = _MODELS.get(name, name)
-    # Without a name, OpenCV's own model: its first coefficients mean the same in all lengths.
-    if name in ("", "pinhole"):
-        model = "rational_polynomial" if len(coefficients) >= _RATIONAL else "plumb_bob"
+    # Without a name, OpenCV's own model.
+    name = "plumb_bob" if name in ("", "pinhole", "none") else name
+    model, coefficients = interpret_lens(name, tuple(_values(D).tolist()))
     return Camera(width, height, _values(K).reshape(3, 3), coefficients, model)
 
 

@@ -88,7 +88,7 @@ def read_camera_info(message: Any) -> Calibration:
             f"binning of {binning[0]} x {binning[1]} leaves nothing of an image of "
             f"{width} x {height}"
         )
-    model, D = _lens(str(message.distortion_model), D)
+    model, D = interpret_lens(str(message.distortion_model), D)
     roi = _roi(message.roi, width, height)
     found = Calibration(frame, width, height, K, D, model, binning, roi)
     if K[0] != 0.0 and (binning != (1, 1) or roi is not None):
@@ -96,20 +96,24 @@ def read_camera_info(message: Any) -> Calibration:
     return found
 
 
-# Other names of the models in drivers.
+# Other names of the models, in drivers and in files.
 _NAMES = {
-    "fisheye": "equidistant", "kannala_brandt": "equidistant", "kannala_brandt4": "equidistant",
-    "plumb bob": "plumb_bob", "radtan": "plumb_bob", "brown_conrady": "plumb_bob",
-    "rational": "rational_polynomial",
+    "fisheye": "equidistant", "opencv_fisheye": "equidistant", "kannala_brandt": "equidistant",
+    "kannala_brandt4": "equidistant", "plumb bob": "plumb_bob", "radtan": "plumb_bob",
+    "brown_conrady": "plumb_bob", "opencv_standard": "plumb_bob",
+    "rational": "rational_polynomial", "double_sphere": str(DistortionModel.DOUBLE_SPHERE),
 }  # fmt: skip
 _RATIONAL = 8  # coefficients of OpenCV's models and more
 
 
-def _lens(said: str, D: tuple[float, ...]) -> tuple[str, tuple[float, ...]]:
-    """Return the model and its coefficients, if the message can mean one lens only.
+def interpret_lens(said: str, D: tuple[float, ...]) -> tuple[str, tuple[float, ...]]:
+    """Return the model and its coefficients, if name and coefficients can mean one lens only.
 
     Drivers of ideal and simulated cameras name no model; others fill D with zeros, or write
     OpenCV's coefficients, which mean the same in all lengths, under the name of the shortest.
+
+    Raises:
+        MessageError: otherwise, saying what was found.
     """
     used = max((k + 1 for k, value in enumerate(D) if value != 0.0), default=0)
     name = _NAMES.get(said.lower(), said.lower())

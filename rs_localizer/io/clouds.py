@@ -78,7 +78,7 @@ def read_correspondences(message: Any) -> Correspondences:
     )
 
 
-def thinned(cloud: Correspondences, most: int, size: tuple[int, int]) -> Correspondences:
+def thin_cloud(cloud: Correspondences, most: int, size: tuple[int, int]) -> Correspondences:
     """Return the cloud with at most ``most`` rows, in their order.
 
     Those with the best scores; without scores, as many of each part of the image as there are.

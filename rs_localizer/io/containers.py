@@ -36,7 +36,7 @@ _SUFFIX = {_MCAP: ".mcap", _SQLITE: ".db3", _BAG: ".bag"}
 _OTHERS = (".jpg", ".jpeg", ".png", ".yaml", ".txt", ".csv", ".json", ".mp4")
 
 
-def magic(path: Path) -> bytes:
+def read_magic(path: Path) -> bytes:
     """Return the first bytes of a file that may be a recording; empty if it cannot be one."""
     with contextlib.suppress(OSError), path.open("rb") as file:
         start = file.read(16)
@@ -60,7 +60,7 @@ def _has_messages(path: Path) -> bool:
 def data_files(folder: Path) -> list[Path]:
     """Return files of a folder that are recordings, in the order of the numbers in their names."""
     files = [
-        file for file in folder.iterdir() if file.suffix.lower() not in _OTHERS and magic(file)
+        file for file in folder.iterdir() if file.suffix.lower() not in _OTHERS and read_magic(file)
     ]
     numbers = {file: [int(n) for n in re.findall(r"\d+", file.name)] for file in files}
     return sorted(files, key=lambda file: (numbers[file], file.name))
@@ -94,11 +94,11 @@ def storage(
     opened: list[Path] = []
     with TemporaryDirectory(prefix="rs_localizer-") as folder:
         for number, file in enumerate(found):
-            kind, data = magic(file), file
+            kind, data = read_magic(file), file
             if kind == ZSTD:
                 data = Path(folder) / f"{number}"
                 unpack(file, data)
-                kind = magic(data)
+                kind = read_magic(data)
             if kind not in _SUFFIX:
                 raise ValueError(f"{file.name} is neither an MCAP, a database of rosbag2 nor a bag")
             _check(data, file.name)
@@ -111,7 +111,7 @@ def storage(
 
 
 def _check(path: Path, name: str) -> None:
-    kind = magic(path)
+    kind = read_magic(path)
     if kind == _MCAP:
         _check_mcap(path, name)
     elif kind == _SQLITE:

@@ -144,11 +144,11 @@ def read_compressed_image(message: Any) -> Image:
     Raises:
         MessageError: for anything else, or an image that is truncated or damaged.
     """
-    pixels = decode(bytes(message.data), str(message.format))
+    pixels = decode_image(bytes(message.data), str(message.format))
     return Image(stamp_ns(message), str(message.header.frame_id), pixels)
 
 
-def decode(packed: bytes, format_: str) -> Gray:
+def decode_image(packed: bytes, format_: str) -> Gray:
     """Decode the pixels (h,w) of a JPEG or PNG; ``format_`` is the format that is claimed.
 
     Raises:

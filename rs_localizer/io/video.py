@@ -98,7 +98,9 @@ class Video:
                 for frame in self._decoded(packet):
                     seconds = float(frame.time) if timed and frame.time is not None else last
                     is_new, last = seconds > last, max(last, seconds)
-                    yield compress(frame.to_ndarray(format="bgr24"), seconds if is_new else None)
+                    yield compress_image(
+                        frame.to_ndarray(format="bgr24"), seconds if is_new else None
+                    )
 
     def _decoded(self, packet: Any) -> list[Any]:
         """Decode the images of a packet; a damaged one has none."""
@@ -165,7 +167,7 @@ def has_times(path: Path | str) -> bool:
     return first[-1].seconds is not None
 
 
-def compress(color: Any, seconds: float | None) -> VideoImage:
+def compress_image(color: Any, seconds: float | None) -> VideoImage:
     """Compress an image (h,w,3) or (h,w) of a video to the form that is kept: JPEG and grey."""
     _, jpeg = cv2.imencode(".jpg", color, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     grey = color if color.ndim == 2 else cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)

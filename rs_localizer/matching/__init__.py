@@ -204,7 +204,7 @@ def find_view(camera: Camera, prior: Prior, points: Array, least_gate: float) ->
     return SearchView(near, float(min(max(least_gate, _DEVIATIONS * deviation), widest)))
 
 
-def predict(camera: Camera, prior: Prior, points: Array, view: SearchView) -> Visible:
+def predict_visible(camera: Camera, prior: Prior, points: Array, view: SearchView) -> Visible:
     """Predict the pixels of the landmarks of a view, each at the time of its own row."""
     assert prior.motion is not None
     near, gate = view.landmarks, view.gate
@@ -392,7 +392,7 @@ class Matcher:
         """Find the two nearest of the landmarks predicted near each query, and its rival (q,)."""
         assert self._index is not None
         view = find_view(camera, prior, self.map.points, gate)
-        visible = predict(camera, prior, self.map.points, view)
+        visible = predict_visible(camera, prior, self.map.points, view)
         nearest, owners = self._index.nearest_within(queries, pixels, visible)
         owner_of = np.full(len(self.map), -1, np.int64)
         owner_of[visible.landmarks] = owners

@@ -69,7 +69,7 @@ def _load() -> tuple[Any, frozenset[str], bool]:
     if os.environ.get(_MODE) in ("numba", "build"):
         return None, frozenset(), True
     has_numba = importlib.util.find_spec("numba") is not None
-    level = levels.choose()
+    level = levels.choose_level()
     if level is None:
         if has_numba and Path(__file__).with_name("jit.py").is_file():
             return None, frozenset(), True

@@ -54,7 +54,7 @@ def of_machine() -> str:
     return level
 
 
-def choose() -> str | None:
+def choose_level() -> str | None:
     """Return the level of the native module to load; None: none has been built.
 
     Raises:

@@ -81,7 +81,7 @@ class DetectionOptions:
     camera: str = ""  # of a rig, whose topics these are
 
 
-def record(
+def record_markers(
     shots: Iterable[Shot | Carried],
     detector: FrameDetector,
     bag: BagWriter,

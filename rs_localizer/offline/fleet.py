@@ -85,7 +85,7 @@ def finished(task: Task) -> Figures | None:
         return None
 
 
-def perform(task: Task) -> Outcome:
+def perform_task(task: Task) -> Outcome:
     """Do a task, unless it has been done; its folder is there afterwards, whole, or not at all.
 
     Whatever goes wrong with the recording is an outcome, not an exception.
@@ -129,7 +129,7 @@ def perform_all(
         ImportError: without Dask.
     """
     if scheduler is None and workers is None:
-        yield from ((task, perform(task)) for task in tasks)
+        yield from ((task, perform_task(task)) for task in tasks)
         return
     import dask.config
     from distributed import Client, KilledWorker, LocalCluster, as_completed
@@ -148,14 +148,16 @@ def perform_all(
             reason = " ".join(str(error).split())
             raise ValueError(f"no Dask scheduler answers at {scheduler}: {reason}") from error
         # Not by what they are: a result that has been removed would be taken as done.
-        futures = dict(zip(client.map(perform, tasks, pure=False), tasks, strict=True))
+        futures = dict(zip(client.map(perform_task, tasks, pure=False), tasks, strict=True))
         again = list[Task]()  # Dask blames all that waited at a worker for its end
         for future in as_completed(futures):
             if isinstance(future.exception(), KilledWorker):
                 again.append(futures[future])
             else:
                 yield futures[future], _outcome(future)
-        yield from ((task, _outcome(client.submit(perform, task, pure=False))) for task in again)
+        yield from (
+            (task, _outcome(client.submit(perform_task, task, pure=False))) for task in again
+        )
 
 
 def _outcome(future: Any) -> Outcome:

@@ -20,7 +20,7 @@ from rs_localizer.io.atomic_files import atomic_files, write_errors
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_files import pixel_intrinsics
 from rs_localizer.io.outputs import Localized
-from rs_localizer.offline.replay import NO_FRAMES, prepare, replay
+from rs_localizer.offline.replay import NO_FRAMES, prepare_replay, replay
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at
 from rs_localizer.pipeline.refusal import Refusal
@@ -241,7 +241,7 @@ def localize_recording(
     if config.of_cameras:
         raise ValueError("a table is of one camera: leave the setting cameras out")
     with open_bag(Path(source)) as bag:
-        topics, localizer = prepare(bag, config)
+        topics, localizer = prepare_replay(bag, config)
         rows = FrameTable(source, localizer)
         for frame in replay(bag, topics, localizer):
             if frame.result or frame.result.reason not in NO_FRAMES:

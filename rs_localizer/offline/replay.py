@@ -340,7 +340,7 @@ def _connected(tree: TransformTree, target: str, source: str) -> bool:
     return True
 
 
-def prepare(
+def prepare_replay(
     bag: BagReader,
     config: NodeConfig,
     given: Mapping[str, str | None] | None = None,

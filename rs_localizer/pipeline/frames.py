@@ -28,7 +28,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.camera_info import Calibration
-from rs_localizer.io.clouds import Correspondences, select_inliers, thinned
+from rs_localizer.io.clouds import Correspondences, select_inliers, thin_cloud
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import CAMERA_INFO, MAP_POINTS
@@ -322,7 +322,7 @@ class FrameLocalizer(ABC):
                 Notice.TOO_MANY_POINTS,
                 f"{of}{len(cloud.points)} points have come; max_points of them, {most}, are used",
             )
-        return thinned(cloud, most, camera.size)
+        return thin_cloud(cloud, most, camera.size)
 
     def _explained(
         self, refusal: Refusal, tried: Callable[[], str], notice: Notice = Notice.WOULD_FIT

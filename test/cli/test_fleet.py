@@ -19,7 +19,7 @@ import pytest
 
 from rs_localizer.cli.commands import main
 from rs_localizer.offline import fleet
-from rs_localizer.offline.fleet import Outcome, Task, do_all, perform, tasks_of
+from rs_localizer.offline.fleet import Outcome, Task, do_all, perform_task, tasks_of
 
 SHUTTER = ["-p", "readout_time:=0.03"]
 
@@ -107,10 +107,12 @@ def test_what_goes_wrong_is_one_line(recordings, tmp_path, monkeypatch, capsys):
 
 def test_workers_that_cannot_do_it_say_why(tmp_path):
     (task,) = tasks_of([tmp_path / "bag"], tmp_path, _fail, "settings")
-    assert "install the same" in str(perform(dataclasses.replace(task, settings="0.1 settings")))
+    assert "install the same" in str(
+        perform_task(dataclasses.replace(task, settings="0.1 settings"))
+    )
     elsewhere = dataclasses.replace(task, folder=tmp_path / "no" / "bag")
-    assert f"does not see {tmp_path}/no" in str(perform(elsewhere))
-    assert perform(task) == f"ZeroDivisionError: of {tmp_path}/bag"
+    assert f"does not see {tmp_path}/no" in str(perform_task(elsewhere))
+    assert perform_task(task) == f"ZeroDivisionError: of {tmp_path}/bag"
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "a").mkdir()
     places = [tmp_path / "a" / "bag.mcap", tmp_path / "bag.mcap", tmp_path / "bag.mcap"]
@@ -181,7 +183,7 @@ def test_ctrl_c_leaves_whole_results_only_and_the_next_run_goes_on(
     assert {"0"} <= done
     assert {path.name for path in out.iterdir() if path.is_dir()} == done
     assert all((out / name / "fleet.json").is_file() for name in done)
-    instead(monkeypatch, perform)
+    instead(monkeypatch, perform_task)
     assert main(words) == 0
     assert f"{len(done)} of 3 recordings have been done before\n" in capsys.readouterr().out
     assert {row["reason"] for row in rows(out).values()} == {""}

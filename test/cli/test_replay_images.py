@@ -15,7 +15,7 @@ from rs_localizer.cli.commands import main
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_files import write_calibration
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.images import decode
+from rs_localizer.io.images import decode_image
 
 READOUT = 0.02
 
@@ -28,7 +28,7 @@ def walls(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert main(["simulate", str(path), *words, "--trajectory", "tum_vi_room5"]) == 0
     with open_bag(path) as bag:
         (topic,) = (t for t, kind in bag.topics.items() if kind.endswith("Image"))
-        images = [decode(bytes(m.data), m.format) for _, _, m in bag.messages([topic])]
+        images = [decode_image(bytes(m.data), m.format) for _, _, m in bag.messages([topic])]
         (info,) = (t for t, kind in bag.topics.items() if kind.endswith("CameraInfo"))
         camera = read_camera_info(next(m for _, _, m in bag.messages([info]))).camera(
             0.0, "top_to_bottom"

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rs_localizer.features.extraction import FeatureExtractor, balanced
+from rs_localizer.features.extraction import FeatureExtractor, choose_balanced
 
 # OpenCV 5 has AKAZE in its contrib modules only.
 KINDS = [
@@ -152,7 +152,7 @@ def test_dim_parts_keep_keypoints(size):
     dim = rng.uniform((0.1 * size[0], 0), size, (2000, 2))
     pixels = np.vstack([bright, dim])
     scores = np.concatenate([rng.uniform(10, 11, 2000), rng.uniform(0, 1, 2000)])
-    rows = balanced(pixels, scores, size, 500)
+    rows = choose_balanced(pixels, scores, size, 500)
     assert len(rows) == len(set(rows.tolist())) == 500
     # By score alone there would be none.
     assert np.count_nonzero(rows >= 2000) > 350

@@ -18,7 +18,7 @@ from rs_localizer.io.clouds import (
     read_keypoints,
     read_map,
     select_inliers,
-    thinned,
+    thin_cloud,
 )
 from rs_localizer.io.messages import MessageError
 
@@ -167,8 +167,8 @@ def test_of_many_points_the_best_are_kept_in_their_order(make_cloud_message):
     rows = [[*row, score] for row, score in zip(ROWS, [3, 9, 1, 8, 7] * 3, strict=False)]
     fields = [*PLAIN, ("score", 20, 7)]
     read = read_correspondences(make_cloud_message(rows, fields, point_step=24))
-    assert thinned(read, 12, (640, 480)) is read
-    few = thinned(read, 4, (640, 480))
+    assert thin_cloud(read, 12, (640, 480)) is read
+    few = thin_cloud(read, 4, (640, 480))
     assert few.scores.tolist() == [9, 8, 9, 9]  # of the eights, the first one
     assert few.points[:, 0].tolist() == [0.5, 1.5, 3.0, 5.5]
     assert len(few.table) == len(few.pixels) == 4
@@ -180,7 +180,7 @@ def test_without_scores_each_part_of_the_image_keeps_as_many(make_cloud_message)
         [1.0, 0.0, 1.0, 40.0 * column, 40.0 * row] for column in range(1, 16) for row in range(12)
     ]
     read = read_correspondences(make_cloud_message(crowd + spread, PLAIN, point_step=20))
-    few = thinned(read, 190, (640, 480))
+    few = thin_cloud(read, 190, (640, 480))
     assert len(few.points) == 190
     assert np.count_nonzero(few.points[:, 0] == 1.0) == len(spread)
 

@@ -30,7 +30,7 @@ from rosbags.typesys import Stores, get_typestore
 from rs_localizer.core.camera import Camera
 from rs_localizer.io import containers
 from rs_localizer.io.bags import open_bag, typestore
-from rs_localizer.io.images import decode
+from rs_localizer.io.images import decode_image
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import MapError, make_map
 from rs_localizer.io.messages import MessageError
@@ -321,12 +321,12 @@ def progressive(size: int) -> bytes:
 @pytest.mark.parametrize("image", [png(12_000, 1), png(8_000, 64), progressive(6_000)])
 def test_images_that_are_all_alike(image):
     with pytest.raises(MessageError, match=r"says that it is (12000|8000|6000) x .*, too much for"):
-        decode(image, "")
+        decode_image(image, "")
 
 
 @pytest.mark.parametrize("image", [png(2_000, 1), png(1_900, 64), progressive(1_900)])
 def test_small_images_may_be_all_alike(image):
-    assert not decode(image, "").any()
+    assert not decode_image(image, "").any()
 
 
 @pytest.mark.parametrize("size", [(2**31, 480), (640, 2**31), (70_000, 480)])

@@ -10,7 +10,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.recording import make_camera_info
-from rs_localizer.offline.replay import prepare, replay
+from rs_localizer.offline.replay import prepare_replay, replay
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import simulate_frames
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings
@@ -40,7 +40,7 @@ def answers(path, frames, start_ns, unset=()):
             bag.write("/camera_info", make_camera_info(CAMERA, then), then)
             bag.write("/correspondences", cloud, then)
     with open_bag(path) as bag:
-        return [a.result for a in replay(bag, *prepare(bag, NodeConfig(readout_time=0.03)))]
+        return [a.result for a in replay(bag, *prepare_replay(bag, NodeConfig(readout_time=0.03)))]
 
 
 def test_a_recording_that_starts_at_zero_has_its_first_frame(tmp_path, frames):

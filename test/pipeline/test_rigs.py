@@ -8,7 +8,7 @@ import pytest
 from rs_localizer.core import so3
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.outputs import Localized
-from rs_localizer.offline.replay import prepare, replay
+from rs_localizer.offline.replay import prepare_replay, replay
 from rs_localizer.settings import build, load_params_file
 
 from .opposed_pair import PARTS, hand, record, rich
@@ -19,7 +19,7 @@ def localize(path, **settings):
     values = load_params_file(path / "parameters.yaml") | {"min_inliers": 20} | settings
     notices: list[tuple[str, str]] = []
     with open_bag(path) as bag:
-        topics, localizer = prepare(
+        topics, localizer = prepare_replay(
             bag, build(values), notice=lambda name, text: notices.append((name, text))
         )
         answers = [answer.result for answer in replay(bag, topics, localizer)]

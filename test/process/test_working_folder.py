@@ -87,7 +87,7 @@ def test_of_a_worker_that_another_program_has_started(sent):
         "task = fleet.Task(later, Path('a.mcap'), out, said)\n"
     )
     assert ran(sent, "-c", f"{work}later()") == ["later"]
-    assert ran(sent, "-c", f"{work}fleet.perform(task)") == []
+    assert ran(sent, "-c", f"{work}fleet.perform_task(task)") == []
 
 
 @pytest.mark.parametrize("path", [f":{ROOT}", f"{ROOT}:"])

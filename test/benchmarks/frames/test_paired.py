@@ -28,8 +28,6 @@ from benchmarks.frames.paired import Result, line, outcome, ratios
 from benchmarks.frames.switches import SWITCHES, found, switched_off
 from benchmarks.independent.scenes import Rich, SmallPlane, Wall
 
-ALL = [*paired_set.benches(), *paired_set.others()]
-
 
 def frames(count: int, deg: float = 1.0, pose: float = 1.0, lost: int = 0) -> Judged:
     """Frames of the same figures, the first of which have no pose."""
@@ -39,17 +37,6 @@ def frames(count: int, deg: float = 1.0, pose: float = 1.0, lost: int = 0) -> Ju
     figures[:, FIGURES.index("pose")] = pose
     figures[:lost, 2:] = math.nan
     return Judged(figures, ["lost"] * lost + [""] * (count - lost))
-
-
-def test_the_set_has_what_issues_name():
-    names = [f"{one.bench}/{one.name}" for one in ALL]
-    assert len(set(names)) == len(names) == 69 + 25
-    assert [one.bench for one in ALL].count(paired_set.OTHERS) == 25
-    counts = dict.fromkeys(paired_set.SPOILT, 0)
-    for number, one in paired_set.spoilt():
-        counts[one.bench] += number
-    # Wrong lenses and parts of the map that moved are of benchmarks.frames.gross.
-    assert counts == {"lens": 0, "garbage": 44, "bodies": 32, "facades": 20, "near": 40}
 
 
 def test_matches_near_their_places_are_a_share_of_them():
