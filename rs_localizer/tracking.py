@@ -40,7 +40,7 @@ from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.estimation.known_rotation import Aid, Foretold, LastFrame
 from rs_localizer.estimation.moved_part import MovedPart
-from rs_localizer.estimation.prior import Prior, beside, unchecked
+from rs_localizer.estimation.prior import Prior, beside, predicted, unchecked
 from rs_localizer.estimation.window import (
     FADING,
     LENGTH,
@@ -274,10 +274,7 @@ class Tracker:
         share = self.readout_time_deviation(context) / own
         window = replace(track.window, readout_share=share)
         motion, covariance = window.after(time_ns).per_readout(own if span is None else span)
-        try:
-            return Prior(motion=motion, covariance=covariance + track.swing)
-        except ValueError:  # rounding errors are all that is left of the covariance
-            return None
+        return predicted(motion, covariance + track.swing)
 
     def at(self, time_ns: int, readings: Any = None) -> Estimate | None:
         """Return the motion at a time, in ns as :meth:`localize` takes it.

@@ -158,12 +158,27 @@ class Prior:
                 )
 
 
+_NOTHING = Prior()
+
+
 def unchecked(prior: Prior, **changed: Any) -> Prior:
     """Return a prior with other parts; what was checked of it is not checked again."""
     found = object.__new__(Prior)
     for each in fields(Prior):
         object.__setattr__(found, each.name, changed.get(each.name, getattr(prior, each.name)))
     return found
+
+
+def predicted(motion: Motion, covariance: Array) -> Prior | None:
+    """Return the prior that a track predicts; None if its covariance is left with rounding errors.
+
+    The motion is one that was found, and is not checked again.
+    """
+    try:
+        check_covariance(covariance)
+    except ValueError:
+        return None
+    return unchecked(_NOTHING, motion=motion, covariance=covariance)
 
 
 def state_in(motion: Motion, centre: Array) -> Array:

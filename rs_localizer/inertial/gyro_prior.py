@@ -43,7 +43,7 @@ from rs_localizer.core.state import (
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.known_rotation import LastFrame, turn_of, whole_covariance
 from rs_localizer.estimation.linear_fit import BLOCKS, MIDDLE, TURNS
-from rs_localizer.estimation.prior import Prior, state_in
+from rs_localizer.estimation.prior import Prior, predicted, state_in
 from rs_localizer.estimation.window import MotionSample
 from rs_localizer.inertial.gravity import gravity_seen
 from rs_localizer.inertial.samples import ImuSamples
@@ -246,10 +246,8 @@ class GyroscopeTrack:
             return GyroPrediction(found, rotation_by(found, self.errors), None, None)
         foreseen = self._carried(found, last, 1e-9 * (middle_ns - last.middle_ns))
         rotation = RotationPrior(*found[:3], foreseen.covariance, predicted=True)
-        prior = Prior(
-            motion=foreseen.motion, covariance=foreseen.covariance[:PARAMETERS, :PARAMETERS]
-        )
-        return GyroPrediction(found, rotation, prior, foreseen)
+        prior = predicted(foreseen.motion, foreseen.covariance[:PARAMETERS, :PARAMETERS])
+        return None if prior is None else GyroPrediction(found, rotation, prior, foreseen)
 
     def _gravity(self, samples: ImuSamples, middle_ns: int) -> Prior | None:
         up = self._settings.gravity_in_map

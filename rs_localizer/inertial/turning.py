@@ -73,12 +73,13 @@ def densified(times: Array, rates: Array) -> tuple[Array, Array]:
     """
     if not 3 < len(times) <= _MOST:
         return times, rates
-    wanted = 0.5 * (times[1:] + times[:-1])
+    dense = np.empty(2 * len(times) - 1)
+    dense[::2], dense[1::2] = times, 0.5 * (times[1:] + times[:-1])
     per_second, mean = 2.0 * _BAND / float(np.median(np.diff(times))), rates.mean(axis=0)
-    own, across = (np.sinc(per_second * (t[:, None] - times)) for t in (times, wanted))
-    between = across @ np.linalg.solve(own + _NOISE * np.eye(len(times)), rates - mean) + mean
-    dense, found = np.empty(2 * len(times) - 1), np.empty((2 * len(times) - 1, 3))
-    dense[::2], dense[1::2], found[::2], found[1::2] = times, wanted, rates, between
+    alike = np.sinc(per_second * (dense[:, None] - times))
+    known = alike[::2] + _NOISE * np.eye(len(times))
+    found = alike @ np.linalg.solve(known, rates - mean) + mean
+    found[::2] = rates
     return dense, found
 
 
