@@ -414,18 +414,15 @@ class Localizer:
             declared=math.hypot(posterior.declared, effect.residual),  # px, of map and calibration
             speeding=speeding(observed, posterior.state),
         )
+        gate, rolling = self._gate(observed, posterior.state), self._solver.rolling_shutter
         failure = refusal(
-            posterior,
-            best.samples,
-            min_inliers=self.config.min_inliers,
-            threshold=self._gate(observed, posterior.state),
-            rolling=self._solver.rolling_shutter,
-        )
+            posterior, best.samples, min_inliers=self.config.min_inliers, threshold=gate,
+            rolling=rolling,
+        )  # fmt: skip
         if failure is not None:
             return failure
         odd = LeftOut()
-        if self._solver.rolling_shutter:  # a global shutter leaves out rows of one that moves
-            gate = self._gate(observed, posterior.state)
+        if rolling:  # a global shutter leaves out rows of one that moves
             odd = left_out(self._search, observed, posterior, gate, known=tracked)
         if odd.failure is not None:
             return odd.failure

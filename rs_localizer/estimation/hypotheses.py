@@ -54,7 +54,6 @@ from rs_localizer.estimation.robust import (
     WIDEST_GATE,
     apply_step,
     best_motion,
-    solve_positive,
 )
 from rs_localizer.estimation.smooth_error import (
     ORDINARY,
@@ -147,7 +146,6 @@ class Posterior(NamedTuple):
 class MotionHypothesis(NamedTuple):
     """A motion that a camera may have."""
 
-    name: str
     speed: float  # part of the configured one
     terms: PriorTerms  # of its motion
     odds: float  # logarithm, by all but the points
@@ -271,7 +269,6 @@ def speeds_of(terms: PriorTerms, assumed: Assumed, is_clear: bool) -> list[Motio
     turn = assumed.turn
     return [
         MotionHypothesis(
-            f"speed {speed:g}",
             speed,
             terms if speed == 1.0 else terms_at(terms, speed, turn is not None),
             (assumed.of_rest if speed == 0.0 else 0.0) + (turn.evidence(speed) if turn else 0.0),
@@ -552,13 +549,11 @@ def _in_functions(covariance: Array) -> Array:
 
 def _clearly_moving(given: _Given) -> bool:
     """Return True if neither rest nor another typical speed would change anything."""
-    turn_known = given.assumed.turn is not None
-    first = LINEAR.start if turn_known else VELOCITIES.start  # the others are known
-    place = slice(first, VELOCITIES.stop)
-    spread = given.best.covariance[place, place].copy()
+    known = given.assumed.turn is not None  # and only the way is not
+    place = slice(LINEAR.start if known else VELOCITIES.start, VELOCITIES.stop)
+    spread = given.best.covariance[place, place]
     part = float(np.diagonal(given.terms.informations[0])[place] @ np.diagonal(spread))
-    if not part < _LITTLE_OF_THE_PRIOR:
-        return False
     velocities = given.best.state[POSE_SIZE - POSE.stop :][place]
-    solved, _ = solve_positive(spread, velocities)
-    return bool(velocities @ solved > _CLEARLY_MOVING)
+    return part < _LITTLE_OF_THE_PRIOR and bool(
+        velocities @ np.linalg.solve(spread, velocities) > _CLEARLY_MOVING
+    )

@@ -52,6 +52,14 @@ def frame(seed, speed, noise, count=60, acceleration=0.0, **more):
     return observe(state, points, noise, rng, **more), state
 
 
+def changed(observations, points=None, gradient=None):
+    """The observations of other points (n,3), or with another gradient (2,) of the row times."""
+    return Observations.of(
+        observations.points if points is None else points, observations.rays, observations.tau,
+        observations.by_ray, observations.mounts if gradient is None else Mounts.one(gradient),
+    )  # fmt: skip
+
+
 def fitted(observations, start, prior, threshold):
     """The best motion near a state (24,)."""
     return Posterior(*best_motion(observations.packed, observations.count, start, prior, threshold))

@@ -11,7 +11,7 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.estimation.acceptance import refusal, speeding
 from rs_localizer.estimation.prior import motion_terms
 
-from .frames import fitted
+from .frames import fitted, frame
 
 PRIOR = motion_terms((0.18, 0.09), (0.009, 0.0036))
 THRESHOLD = 2.0
@@ -19,11 +19,9 @@ ELEVEN = np.arange(40) < 11
 
 
 @pytest.fixture
-def good(scene):
-    camera, motion, points, _, measured = scene.frame(noise=0.3, count=40)
-    observations = scene.observe(camera, points, measured)
-    posterior = fitted(observations, scene.state_of(motion), PRIOR, THRESHOLD)
-    return posterior._replace(gate=THRESHOLD)
+def good():
+    observations, truth = frame(0, 0.15, 0.3, count=40)
+    return fitted(observations, truth, PRIOR, THRESHOLD)._replace(gate=THRESHOLD)
 
 
 def reason(posterior):

@@ -6,7 +6,7 @@ import pytest
 from rs_localizer.estimation.prior import held_terms, motion_terms
 from rs_localizer.estimation.robust import decided, inverted, noise_deviation
 
-from .frames import fitted
+from .frames import fitted, frame
 
 # Per readout of 0.03 s: the defaults.
 PRIOR = motion_terms((0.18, 0.09), (0.009, 0.0036))
@@ -26,15 +26,6 @@ def test_noise_counts_the_degrees_of_freedom_and_never_divides_by_none():
     # Points strewn evenly over the gate show no noise that fits into it.
     strewn = np.linspace(0.0, 4.0, 500)
     assert noise_deviation(strewn, 2.0, 0.0) > 1.9
-
-
-def observe(scene, speed, noise, count, seed, outliers=0):
-    camera, motion, points, _, measured = scene.frame(
-        speed=speed, noise=noise, count=count, seed=seed
-    )
-    rng = np.random.default_rng(seed)
-    measured[:outliers] = rng.uniform([0, 0], [639, 479], (outliers, 2))
-    return scene.observe(camera, points, measured), scene.state_of(motion)
 
 
 def information(seed=0, points=1.0):
@@ -58,11 +49,11 @@ def test_points_decide_what_the_prior_leaves_to_them(as_python):
     assert share_of(inverted(weak), PRIOR, noise) == pytest.approx(6.0, abs=1e-3)
 
 
-def test_the_noise_of_few_points_is_not_lowered_by_what_they_fit(scene):
+def test_the_noise_of_few_points_is_not_lowered_by_what_they_fit():
     """Squared errors per degree of freedom, over many frames, are the variance of the noise."""
     squared, freedom = 0.0, 0.0
     for seed in range(60):
-        observations, truth = observe(scene, 0.05, 0.5, 20, seed)
+        observations, truth = frame(seed, 0.05, 0.5, count=20)
         posterior = fitted(observations, truth, PRIOR, 5.0)
         squared += posterior.squared_errors.sum()
         freedom += posterior.freedom

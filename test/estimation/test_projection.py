@@ -9,12 +9,13 @@ from rs_localizer.estimation import projection
 from rs_localizer.estimation.robust import apply_step
 from rs_localizer.integrity import likeness
 
+from .frames import changed, frame
+
 
 @pytest.mark.parametrize("softness", [0.0, 1.0])
-def test_robust_cost_and_its_slope_belong_together(scene, softness):
-    camera, motion, points, _, measured = scene.frame(noise=2.0, seed=5, acceleration=0.2)
-    data = scene.pack(camera, points, measured, np.zeros(2))
-    state, scale, h = scene.state_of(motion), 3.0, 1e-6
+def test_robust_cost_and_its_slope_belong_together(softness):
+    observations, state = frame(5, 0.15, 2.0, count=21, acceleration=0.2)
+    data, scale, h = changed(observations, gradient=np.zeros(2)).packed, 3.0, 1e-6
     information, slope = np.empty((18, 18)), np.empty(18)
 
     def cost_of(s):
@@ -28,13 +29,12 @@ def test_robust_cost_and_its_slope_belong_together(scene, softness):
         assert derivative == pytest.approx(2 * slope[k], rel=1e-3, abs=1.0)
 
 
-def test_truncated_costs_are_those_of_the_formulas(as_python, scene):
+def test_truncated_costs_are_those_of_the_formulas(as_python):
     truncated_cost = as_python(projection.truncated_cost)
     # A search's cost is that of its one look, which knows no accelerations.
-    camera, motion, points, _, measured = scene.frame(noise=2.0, seed=5)
-    data = scene.pack(camera, points, measured, np.zeros(2))
-    state = scene.state_of(motion)
-    squared, c2 = projection.squared_errors(data, len(points), state), 9.0
+    observations, state = frame(5, 0.15, 2.0, count=21)
+    data = changed(observations, gradient=np.zeros(2)).packed
+    squared, c2 = projection.squared_errors(data, observations.count, state), 9.0
     assert (squared > c2).any()
     assert (squared < c2).any()
     truncated = truncated_cost(data, state, 3.0, np.inf)
@@ -49,23 +49,20 @@ def test_truncated_costs_are_those_of_the_formulas(as_python, scene):
     assert 0.1 * truncated <= bounded < truncated
 
 
-def test_points_behind_the_camera_are_outliers_and_disturb_nothing(scene):
-    camera, motion, points, _, measured = scene.frame()
-    behind = points.copy()
-    depth = (points @ motion.rotation.T + motion.translation)[:, 2]
-    behind[0] = points[0] - 2 * depth[0] * motion.rotation[2]
-    state = scene.state_of(motion)
-    data = scene.pack(camera, behind, measured)
-    squared = projection.squared_errors(data, len(points), state)
+def test_points_behind_the_camera_are_outliers_and_disturb_nothing():
+    observations, state = frame(0, 0.15, 0.0, count=21)
+    behind, axis = observations.points.copy(), state[6:9]
+    behind[0] -= 2.0 * (axis @ behind[0] + state[11]) * axis
+    data = changed(observations, behind).packed
+    squared = projection.squared_errors(data, observations.count, state)
     assert np.isinf(squared[0])
     assert squared[1:].max() < 1e-6
-    information, slope = np.empty((18, 18)), np.empty(18)
-    without = np.empty((18, 18))
-    projection.normal_equations(data, state, 3.0, 0.0, 2, information, slope)
-    projection.normal_equations(
-        scene.pack(camera, points[1:], measured[1:]), state, 3.0, 0.0, 2, without, slope
-    )
-    np.testing.assert_allclose(information, without, rtol=1e-9, atol=1e-6)
+    found = np.empty((2, 18, 18))
+    for each, information in zip(
+        (data, observations.only(np.arange(1, 21)).packed), found, strict=True
+    ):
+        projection.normal_equations(each, state, 3.0, 0.0, 2, information, np.empty(18))
+    np.testing.assert_allclose(*found, rtol=1e-9, atol=1e-6)
 
 
 def test_likeness_is_the_mean_over_nearest_neighbours():

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rs_localizer.core.shutter import Motion
 from rs_localizer.estimation.prior import motion_terms
 from rs_localizer.estimation.search import (
     NOTHING,
@@ -21,6 +20,8 @@ from rs_localizer.estimation.search import (
     state_of_model,
 )
 from rs_localizer.solvers.table import find_solver
+
+from .frames import changed, frame
 
 FREE = motion_terms((0.0, 0.0), (0.0, 0.0))
 ROWS = 1.0  # range of the row times
@@ -41,20 +42,14 @@ class Solver:
         models[0] = np.where(good, self.model[:, None], wrong[:, None])
 
 
-@pytest.fixture
-def problem(scene):
-    def make(outlier_share, seed=0, count=100):
-        camera, motion, points, _, measured = scene.frame(speed=0.1, noise=0.3, count=count)
-        outliers = np.arange(count) < outlier_share * count
-        rng = np.random.default_rng(seed)
-        measured[outliers] = rng.uniform([0, 0], [639, 479], (outliers.sum(), 2))
-        observations = scene.observe(camera, points, measured)
-        w = -motion.angular_velocity
-        drift = np.cross(w, motion.translation) - motion.linear_velocity
-        model = np.concatenate([motion.rotation.ravel(), motion.translation, w, drift])
-        return observations, model, outliers
-
-    return make
+def problem(outlier_share):
+    """100 observations, the solver's model of their motion, and which of them are wrong."""
+    observations, state = frame(0, 0.1, 0.3, count=100)
+    outliers, points = np.arange(100) < outlier_share * 100, observations.points.copy()
+    points[outliers] += np.random.default_rng(0).uniform(-2.0, 2.0, (outliers.sum(), 3))
+    drift = np.cross(-state[12:15], state[9:12]) - state[15:18]
+    model = np.concatenate([state[:12], -state[12:15], drift])
+    return changed(observations, points), model, outliers
 
 
 def run(observations, solver, pools, max_samples=2000, start=NOTHING):
@@ -76,7 +71,7 @@ EVERYTHING = np.arange(100)
 ALL = pools_from(EVERYTHING)
 
 
-def test_it_finds_the_inliers_and_stops_when_it_is_sure(problem):
+def test_it_finds_the_inliers_and_stops_when_it_is_sure():
     observations, model, outliers = problem(0.5)
     solver = Solver(model, outliers)
     found = run(observations, solver, ALL)
@@ -87,7 +82,7 @@ def test_it_finds_the_inliers_and_stops_when_it_is_sure(problem):
     assert found.samples == sum(map(len, solver.samples))
 
 
-def test_good_pools_stop_the_search_early_and_all_are_drawn_from(problem):
+def test_good_pools_stop_the_search_early_and_all_are_drawn_from():
     observations, model, outliers = problem(0.7)
     solver = Solver(model, outliers)
     found = run(observations, solver, pools_from(np.flatnonzero(~outliers), EVERYTHING))
@@ -130,8 +125,8 @@ def test_samples_spread_over_the_rows_where_they_can(samples_of):
     assert (samples_of(np.arange(10), 5, 6, np.zeros(10)) >= 0).all()
 
 
-def test_models_become_states_by_the_motion_model(as_python, scene):
+def test_models_become_states_by_the_motion_model(as_python):
     model = np.random.default_rng(0).normal(size=18)
-    rotation, c, w, drift = model[:9].reshape(3, 3), model[9:12], model[12:15], model[15:18]
-    motion = Motion(rotation, c, -w, np.cross(w, c) - drift)
-    np.testing.assert_allclose(as_python(state_of_model)(model), scene.state_of(motion), atol=1e-15)
+    c, w, drift = model[9:12], model[12:15], model[15:18]
+    expected = np.concatenate([model[:12], -w, np.cross(w, c) - drift, np.zeros(6)])
+    np.testing.assert_allclose(as_python(state_of_model)(model), expected, atol=1e-15)
