@@ -29,7 +29,7 @@ from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE, TURN, rotation_of
 from rs_localizer.estimation.hypotheses import Posterior
 from rs_localizer.estimation.points import Observed, rays_of_lens
-from rs_localizer.estimation.prior import SPEEDS, add_prior, terms_at
+from rs_localizer.estimation.prior import SPEEDS, PriorTerms, add_prior, terms_at
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.robust import inverted
 from rs_localizer.estimation.smooth_error import ORDINARY, smooth_columns
@@ -95,12 +95,13 @@ NO_EFFECT = CalibrationEffect(np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)), 
 
 
 def calibration_effect(
-    observed: Observed, posterior: Posterior, deviation: CalibrationErrors, tracked: bool,
-    of_map: ErrorModes | None = None,
+    observed: Observed, posterior: Posterior, terms: PriorTerms, deviation: CalibrationErrors,
+    tracked: bool, of_map: ErrorModes | None = None,
 ) -> CalibrationEffect:  # fmt: skip
     """Return the effect of errors of calibration and map on the motion of a frame.
 
     Args:
+        terms: what is known of the motion but for poses of other frames, which are off by as much.
         tracked: poses of other frames are known, so that the covariance has no longer all of what
             the smooth error does.
         of_map: errors of the points; None: they have none.
@@ -159,7 +160,7 @@ def calibration_effect(
         if part < _NO_PART:
             continue
         prior, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
-        of_speed = terms_at(observed.terms, speed, rotation is not None)
+        of_speed = terms_at(terms, speed, rotation is not None)
         add_prior(of_speed, posterior.state, variance, prior, slope)
         inverse = inverted(information + prior)
         if not math.isfinite(inverse[0, 0]):

@@ -37,7 +37,6 @@ from rs_localizer.estimation.projection import (
     GRADIENT,
     POINT_SIZE,
     WEIGHT,
-    linearized,
     squared_errors,
 )
 from rs_localizer.native import entry, kernel
@@ -258,53 +257,6 @@ class Observations:
 # More points than this only take time.
 MOST_POINTS = 2500
 NEAREST = 1e-6  # m; points nearer than this would make any map useless
-# With fewer points the difference is lost in their noise, and takes time.
-_MANY = 300
-# Errors beyond which (px) the motion says nothing of where a point ought to be.
-_NEAR = 10.0
-
-
-def relinearized(
-    exposure: Exposure,
-    observations: Observations,
-    state: Array,
-    rotation: RotationPrior | None,
-    fewest: int = _MANY,
-) -> Observations:
-    """Return observations with derivatives at a motion near the best; few points stay.
-
-    Derivatives of pixels by rays that are taken where the points were measured have the noise of
-    the points in them. Through a lens that bends much (a fisheye), or with a known rotation, the
-    columns of a motion then differ a little from fields of errors that it can mimic. That
-    difference is in step with the errors, and thousands of points would take it for a wrong map or
-    lens.
-
-    Args:
-        state: (24,) of the motion.
-        rotation: the known one that was taken out of the observations.
-        fewest: number of points from which on they are linearized anew.
-    """
-    count = observations.count
-    if count < fewest or (rotation is None and all(len(each.D) == 0 for each in exposure.cameras)):
-        return observations
-    lines = linearized(observations.packed, count, state, np.zeros((count, 6)))
-    near = np.abs(lines.errors).max(axis=1) < _NEAR  # NaN compares false
-    rays = np.where(near[:, None], lines.image, observations.rays)
-    if rotation is None:
-        by_ray = np.empty((count, 2, 2))
-        for place, side in enumerate(exposure.sides):
-            here = observations.camera == place
-            by_ray[here] = side.pixel_jacobian(rays[here])
-    else:
-        (camera,), gradient = exposure.cameras, observations.mounts.gradients[0]
-        raw = rays_of_lens(rotation, observations.tau, rays)
-        by_ray = compensated(raw, observations.tau, camera.pixel_jacobian(raw), gradient, rotation)[
-            1
-        ]
-    return Observations.of(
-        observations.points, observations.rays, observations.tau, by_ray, observations.mounts,
-        observations.camera,
-    )  # fmt: skip
 
 
 def rays_of_lens(rotation: RotationPrior | None, tau: Array, rays: Array) -> Array:
