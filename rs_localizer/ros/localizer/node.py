@@ -147,6 +147,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         self._frames: FrameLocalizer | None = None  # the worker's: here only to be read
         self._publisher: Publisher | None = None
         self._ticks: Timer | None = None  # of output_rate
+        self._latest: dict[str, Any] = {}  # what the inputs of the state last said
         self._needs_tf = True  # of readings whose axes are not the camera's
         super().__init__(**options)
         self._broadcaster = Broadcaster(self, self.refusals)
@@ -161,7 +162,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         self._say_map(frames)
         self.opened.callback(self._broadcaster.close)
         self._broadcaster.configure(config)
-        self._frames, self._needs_tf = frames, True
+        self._frames, self._needs_tf, self._latest = frames, True, {}
         self._publisher = Publisher(self, frames, self._broadcaster)
         self.opened.callback(
             self.destroy_service, self.create_service(Trigger, "~/reset", self._reset)
@@ -276,7 +277,9 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         except MessageError as error:
             self.refusals.add(item.refused, str(error))
             return
-        self._update(item.topic, self._use, item, content)
+        if content != self._latest.get(item.topic):  # drivers repeat camera_info with every image
+            self._latest[item.topic] = content
+            self._update(item.topic, self._use, item, content)
 
     def _take_pose(self, message: Any) -> None:
         """Use a pose that others know."""

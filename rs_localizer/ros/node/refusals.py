@@ -28,9 +28,9 @@ class Refusals:
         self.counts: Counter[str] = Counter()
         self._log, self._clock = log, clock
         self._lock = threading.Lock()
-        # By reason: when it was logged last, and how often it was not since; when it was noticed
-        # last, and the detail.
-        self._logged: dict[str, tuple[float, int]] = {}
+        # By reason and subject: when it was logged last, and how often it was not since; by reason:
+        # when it was noticed last, and the detail.
+        self._logged: dict[tuple[str, str], tuple[float, int]] = {}
         self._latest: dict[str, tuple[float, str]] = {}
 
     def add(self, reason: str, detail: str) -> None:
@@ -39,14 +39,14 @@ class Refusals:
             self.counts[reason] += 1
         self.notice(reason, detail)
 
-    def notice(self, reason: str, detail: str) -> None:
-        """Log an oddity that is no refusal in the same way."""
+    def notice(self, reason: str, detail: str, subject: str = "") -> None:
+        """Log an oddity that is no refusal in the same way; of few subjects, each by itself."""
         with self._lock:
             now = self._clock()
             self._latest[reason] = now, detail
-            when, silent = self._logged.get(reason, (-math.inf, 0))
+            when, silent = self._logged.get((reason, subject), (-math.inf, 0))
             said = now - when < _PERIOD
-            self._logged[reason] = (when, silent + 1) if said else (now, 0)
+            self._logged[reason, subject] = (when, silent + 1) if said else (now, 0)
         if not said:
             more = f" ({silent} more since the last report)" if silent else ""
             self._log(f"{reason}: {detail}{more}")

@@ -162,7 +162,7 @@ class Inputs:
             if self._topics[name].single and len(publishers) > 1:
                 names = " and ".join(sorted(map(node_of, publishers)))
                 text = f"{names} publish on {subscription.topic_name}: their frames alternate"
-                self._refusals.notice(Notice.TWO_PUBLISHERS, text)
+                self._refusals.notice(Notice.TWO_PUBLISHERS, text, name)
             offers = [policies(each.qos_profile) for each in publishers]
             if offers and best(self._wished[name], offers) != policies(subscription.qos_profile):
                 self._node.destroy_subscription(subscription)
@@ -210,7 +210,7 @@ class Inputs:
             cause, mismatch = self._cause(self._subscriptions[name])
         if mismatch:
             self._refusals.notice(
-                Notice.INCOMPATIBLE_PUBLISHER, f"no message arrives on {topic}: {cause}"
+                Notice.INCOMPATIBLE_PUBLISHER, f"no message arrives on {topic}: {cause}", topic
             )
         reliability, _ = policies(self._subscriptions[name].qos_profile)
         reliable = reliability == ReliabilityPolicy.RELIABLE
