@@ -123,7 +123,7 @@ def test_node_and_replay_say_the_same_of_a_pair(recording, tmp_path, start_node,
         play(recording, tmp_path / "out", robot, expected)
         for name in TYPES:
             answered = robot.answered(name)
-            assert len(answered) >= expected
+            assert len(answered) >= len(offline[name]) - 1
             assert answered.items() <= offline[name].items()
         assert peer.spin_until(lambda: "Inliers of right" in robot.values)
         assert "Notice: no_images" in robot.odd
