@@ -52,6 +52,7 @@ class FrameExtractor:
     """
 
     def __init__(self, config: FeatureConfig) -> None:
+        self.described = f"{config.features}, at most {config.max_keypoints} keypoints an image"
         self._extractor = FeatureExtractor(config.features, config.max_keypoints)
 
     def take(self, message: Any) -> Extracted | Refusal:

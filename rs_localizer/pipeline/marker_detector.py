@@ -82,7 +82,8 @@ class FrameDetector:
             if not config.marker_map:
                 raise MarkerMapError("marker_map is not set; it must name the file of the map")
             marker_map = read_marker_map(Path(config.marker_map).expanduser())
-        self.map = marker_map
+        self.map, markers, boards = marker_map, len(marker_map.markers), len(marker_map.boards)
+        self.described = f"{markers} markers and {boards} boards in {marker_map.map_frame}"
         self._notice = notice
         self._detector = MarkerDetector(marker_map, _LEAST_SIDE)
         self._row = _row_type(marker_map.points)

@@ -74,16 +74,17 @@ _ORDERS = [
     if (first, step) != (0, 1)
 ]
 _CORNERS = ("upper left", "upper right", "lower right", "lower left")
-# The mistakes of a plane that do not show: mirrored, it is seen from behind.
-_OF_IMAGES = (_left_right, _upside_down, _exchanged)
-# Corrections by name, and the functions that apply them.
-_MISTAKES: dict[str, Callable[[_Frame], Array | None]] = {
+_Undo = Callable[[_Frame], Array | None]
+# Corrections by name, and the functions that apply them. Of a plane these do not show: mirrored, it
+# is seen from behind.
+_OF_IMAGES: dict[str, _Undo] = {
     "pixels are mirrored left to right: the sender mirrors them (or the map is left-handed)":
         _left_right,
     "pixels are mirrored top to bottom: the sender flips them (or the map is left-handed)":
         _upside_down,
     "u and v are exchanged: u counts columns, v rows": _exchanged,
-} | {
+}  # fmt: skip
+_OF_CORNERS: dict[str, _Undo] = {
     "corners of markers come in another order: where "
     f"{', '.join(_CORNERS)} belong, {', '.join(_CORNERS[order.index(k)] for k in range(4))} stand":
         partial(_reordered, order)
@@ -91,7 +92,7 @@ _MISTAKES: dict[str, Callable[[_Frame], Array | None]] = {
 }  # fmt: skip
 # The two differ by a half turn of the camera and the direction of the shutter, which one image
 # hardly shows: a reversed motion looks alike.
-_MIRRORED = tuple(_MISTAKES)[:2]
+_MIRRORED = tuple(_OF_IMAGES)[:2]
 _EITHER = (
     "pixels are mirrored, left to right or top to bottom: the sender mirrors them (or the map is "
     "left-handed)"
@@ -111,8 +112,8 @@ def what_fits(
     frame = _Frame(pixels, ids, localizer.camera.size)
     flat = _is_flat(points)
     fits: dict[str, tuple[int, float]] = {}
-    for mistake, undone in _MISTAKES.items():
-        if (flat and undone in _OF_IMAGES) or (changed := undone(frame)) is None:
+    for mistake, undone in (_OF_CORNERS if flat else _OF_IMAGES | _OF_CORNERS).items():
+        if (changed := undone(frame)) is None:
             continue
         usable = np.isfinite(changed).all(axis=1)
         found = localizer.localize(points[usable], changed[usable])

@@ -2,12 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node ``feature_detector``: images in; keypoints with descriptors out."""
 
-from typing import Any
-
 from rs_localizer.config import FeatureConfig
 from rs_localizer.features.extraction import draw_features
-from rs_localizer.io.images import Image
-from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import KEYPOINTS
 from rs_localizer.pipeline.keypoints import Extracted, FrameExtractor, keypoints
 from rs_localizer.ros.detector.image_node import ImageNode, Picture
@@ -23,21 +19,14 @@ def tell(extracted: Extracted) -> tuple[int, Told]:
     return extracted.image.stamp_ns, Told(State.DETECTING, text, {"Keypoints": str(count)})
 
 
+def draw(extracted: Extracted) -> Picture:
+    """Return the image with its keypoints."""
+    return draw_features(extracted.image.pixels, extracted.features)
+
+
 class FeatureDetectorNode(ImageNode[FeatureConfig, Extracted]):
     """Looks for keypoints."""
 
     node_name = task = FEATURES_NAME
-    kind, tell = FeatureConfig, staticmethod(tell)
-    output = KEYPOINTS
-
-    def make_finder(self, config: FeatureConfig) -> FrameExtractor:
-        return FrameExtractor(config)
-
-    def make_cloud(self, extracted: Extracted, make: Make) -> Any:
-        return keypoints(extracted, make)
-
-    def draw(self, extracted: Extracted) -> tuple[Image, Picture]:
-        return extracted.image, draw_features(extracted.image.pixels, extracted.features)
-
-    def describe(self, finder: FrameExtractor) -> str:
-        return f"{self.config.features}, at most {self.config.max_keypoints} keypoints an image"
+    kind, output, finder = FeatureConfig, KEYPOINTS, FrameExtractor
+    tell, make_cloud, draw = staticmethod(tell), staticmethod(keypoints), staticmethod(draw)

@@ -19,7 +19,6 @@ from sensor_msgs.msg import Image as ImageMessage
 from rs_localizer.config import DetectorConfig, FeatureConfig, ImageTransport
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io import topics
-from rs_localizer.io.images import Image
 from rs_localizer.io.messages import Make, make_header
 from rs_localizer.io.topics import COMPRESSED_IMAGE, IMAGE
 from rs_localizer.ros.node.conversion import create_output, make_message, steady_timer
@@ -67,11 +66,13 @@ Settings = TypeVar("Settings", DetectorConfig, FeatureConfig)
 class ImageNode(ManagedNode[Settings, Result], Generic[Settings, Result]):
     """Looks at images; see :class:`rs_localizer.ros.node.managed.ManagedNode`.
 
-    A node defines what it looks for by overriding :meth:`make_finder`, :meth:`make_cloud`,
-    :meth:`draw` and :meth:`describe`.
+    A node says by its class what it looks for.
     """
 
     lack = Notice.NO_IMAGES
+    finder: ClassVar[Any]  # makes results of images; knows them in words (``described``)
+    make_cloud: ClassVar[staticmethod[[Any, Make], Any]]  # the PointCloud2 of a result
+    draw: ClassVar[staticmethod[[Any], Picture]]  # the debug picture of a result
     output: ClassVar[str]  # topic of the clouds
     odd: ClassVar[tuple[Notice, ...]] = (Notice.TWO_PUBLISHERS,)  # that the diagnostics repeat
 
@@ -81,27 +82,13 @@ class ImageNode(ManagedNode[Settings, Result], Generic[Settings, Result]):
         self._listening: tuple[str, ...] = ()
         super().__init__(**options)
 
-    # -- what a node looks for ---------------------------------------------------------------
-
     def make_finder(self, config: Settings) -> Any:
         """Make the finder that looks at images; it works offline, too.
 
         Raises:
             ValueError: for settings that cannot be used.
         """
-        raise NotImplementedError
-
-    def make_cloud(self, result: Result, make: Make) -> Any:
-        """Make the sensor_msgs/PointCloud2 of an image."""
-        raise NotImplementedError
-
-    def draw(self, result: Result) -> tuple[Image, Picture]:
-        """Draw an image and its debug picture, in the worker's thread."""
-        raise NotImplementedError
-
-    def describe(self, finder: Any) -> str:
-        """Describe for the log what the node looks for."""
-        raise NotImplementedError
+        return self.finder(config)
 
     # -- as every managed node ---------------------------------------------------------------
 
@@ -124,7 +111,7 @@ class ImageNode(ManagedNode[Settings, Result], Generic[Settings, Result]):
         self._listening = ()
         self.active.callback(self.destroy_timer, steady_timer(self, _LOOK_PERIOD, self._look))
         self.get_logger().info(
-            f"active with {self.describe(self._finder)}; subscribed to images while somebody "
+            f"active with {self._finder.described}; subscribed to images while somebody "
             f"subscribes to {' or '.join(each.topic_name for each in self._outputs)}"
         )
 
@@ -132,15 +119,15 @@ class ImageNode(ManagedNode[Settings, Result], Generic[Settings, Result]):
         if self.worker is not None:
             self.worker.update("settings", lambda: self.use_finder(self.make_finder(config)))
 
-    def _publish(self, result: Result) -> None:
+    def _publish(self, result: Any) -> None:
         """Publish of an image what somebody listens to, in the worker's thread."""
         clouds, pictures = self._outputs
         if clouds.get_subscription_count():
             clouds.publish(self.make_cloud(result, make_message))
         if pictures.get_subscription_count():
-            image, picture = self.draw(result)
+            image = result.image
             header = make_header(make_message, image.stamp_ns, image.frame)
-            pictures.publish(_raw(header, picture))
+            pictures.publish(_raw(header, self.draw(result)))
 
     def examine(self) -> tuple[Health, str]:
         summary = self.statistics.summary()

@@ -2,14 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node ``marker_detector``: images in; correspondences with a marker map out."""
 
-from typing import Any
-
 import numpy as np
 
 from rs_localizer.config import DetectorConfig
 from rs_localizer.core.reasons import Notice
-from rs_localizer.io.images import Image
-from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import CORRESPONDENCES
 from rs_localizer.markers.overlay import draw_detections
 from rs_localizer.pipeline.marker_detector import Detected, FrameDetector, correspondences
@@ -38,12 +34,17 @@ def tell(detected: Detected) -> tuple[int, Told]:
     return detected.image.stamp_ns, Told(State.DETECTING, text, values)
 
 
+def draw(detected: Detected) -> Picture:
+    """Return the image with its markers."""
+    return draw_detections(detected.image.pixels, detected.detections)
+
+
 class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):
     """Looks for markers."""
 
     node_name = task = DETECTOR_NAME
-    kind, tell = DetectorConfig, staticmethod(tell)
-    output = CORRESPONDENCES
+    kind, output = DetectorConfig, CORRESPONDENCES
+    tell, make_cloud, draw = staticmethod(tell), staticmethod(correspondences), staticmethod(draw)
     odd = (
         Notice.OTHER_BOARD, Notice.REPEATED_MARKERS, Notice.TWO_PUBLISHERS, Notice.WOULD_FIT,
     )  # fmt: skip
@@ -66,14 +67,3 @@ class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):
         corners = [marker.corners for marker, _ in finder.map.all_markers()]
         if corners:
             self._map_view.show(finder.map.map_frame, np.array(corners))
-
-    def make_cloud(self, detected: Detected, make: Make) -> Any:
-        return correspondences(detected, make)
-
-    def draw(self, detected: Detected) -> tuple[Image, Picture]:
-        return detected.image, draw_detections(detected.image.pixels, detected.detections)
-
-    def describe(self, finder: FrameDetector) -> str:
-        marker_map = finder.map
-        markers, boards = len(marker_map.markers), len(marker_map.boards)
-        return f"{markers} markers and {boards} boards in {marker_map.map_frame}"
