@@ -91,7 +91,6 @@ class Placement:
 
     similarity: Similarity  # to metres
     scaled: bool
-    levelled: bool  # z is up by what was measured, and not only by how the camera was held
     basis: str
     doubt: str = ""  # why it may be wrong
     up: str = "as the camera was held on average (a guess)"
@@ -115,7 +114,7 @@ def placement(
     turn = upright(_down(rotations))
     if not anchors.distances:
         return Placement(
-            Similarity(1.0, turn, -turn @ positions[0]), False, False, "the scale is undetermined"
+            Similarity(1.0, turn, -turn @ positions[0]), False, "the scale is undetermined"
         )
     factors = []
     for distance in anchors.distances:
@@ -137,7 +136,7 @@ def placement(
             "pixels and the metres"
         )
     return Placement(
-        Similarity(scale, turn, -scale * turn @ positions[0]), True, False,
+        Similarity(scale, turn, -scale * turn @ positions[0]), True,
         f"{len(factors)} measured distances (which agree within {100 * spread:.1f} %)",
     )  # fmt: skip
 
@@ -185,7 +184,7 @@ def _by_markers(marker_map: MarkerMap, triangulated: Triangulated) -> Placement:
             f"the markers' corners are {1e3 * misfit:.1f} mm (rms) off their map, and so may be "
             "the landmarks: check sizes and places in the marker map, and the readout time"
         )
-    return Placement(similarity, True, True, basis, doubt, "as in the marker map")
+    return Placement(similarity, True, basis, doubt, "as in the marker map")
 
 
 def _down(rotations: Array) -> Array:

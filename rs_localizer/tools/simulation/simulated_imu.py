@@ -111,7 +111,6 @@ class ImuTrack:
     times_ns: IntArray  # (n,) when they were taken
     angular_velocities: Array  # (n,3) rad/s, IMU axes
     specific_forces: Array  # (n,3) m/s^2, IMU axes
-    biases: Array  # (n,3) rad/s, the gyroscope's, IMU axes: part of what it measures
 
 
 def simulate_imu(
@@ -138,7 +137,6 @@ def simulate_imu(
         + rng.normal(0.0, settings.gyroscope_noise * root, shape),
         specific_forces=forces + force_bias
         + rng.normal(0.0, settings.accelerometer_noise * root, shape),
-        biases=biases,
     )  # fmt: skip
 
 

@@ -37,7 +37,6 @@ def placed(anchors: Anchors, points: np.ndarray, counts: int = 9):
 def test_markers_give_frame_and_scale():
     placement = placed(Anchors(WALL), back(WALL.points))
     assert placement.scaled
-    assert placement.levelled
     assert np.allclose(placement.similarity(back(WALL.points)), WALL.points)
     assert placement.doubt == ""
     points = WALL.points.copy()
@@ -71,7 +70,6 @@ def test_a_distance_gives_the_scale():
     points = np.array([[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
     placement = placed(Anchors(None, sights("a", "b"), (Distance("a", "b", 3.0),)), points)
     assert placement.scaled
-    assert not placement.levelled
     assert placement.similarity.scale == pytest.approx(1.5)
     # Without anything better, the picture's rows are level: y of the camera's frame is down.
     assert np.allclose(placement.similarity.rotation @ [0.0, 1.0, 0.0], [0.0, 0.0, -1.0])
