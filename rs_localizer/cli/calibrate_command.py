@@ -112,7 +112,7 @@ def _calibrate_one(args: Options) -> Figures:
     if args.out is not None:
         of_images = args.map is not None or args.board is not None
         maps = [_beside(args.out, _MAP)] if of_images else []
-        refuse_existing(args, args.out, *maps, *_lens_files(args).values())
+        refuse_existing(args, args.out, *maps, *_lens_file(args, ""))
     config = given_settings(args)
     source = _read(args, config)
     camera = replace(source.camera, scan_direction=config.scan_direction)
@@ -141,12 +141,10 @@ def _beside(out: Path, name: str) -> Path:
     return out.with_name(f"{out.stem}_{name}")
 
 
-def _lens_files(args: Options, cameras: Sequence[str] = ("",)) -> dict[str, Path]:
-    """Return the files of single lenses by camera, if wanted; for a rig ``FILE_NAME`` of each."""
+def _lens_file(args: Options, name: str) -> list[Path]:
+    """Return the file of a camera's lens alone, if it is wanted; of a rig ``FILE_NAME``."""
     file = args.camera_info
-    if file is None:
-        return {}
-    return {name: file.with_stem(f"{file.stem}_{name}") if name else file for name in cameras}
+    return [file.with_stem(f"{file.stem}_{name}") if name else file] if file else []
 
 
 def _calibrated(
@@ -303,13 +301,11 @@ def _deviations(
         found: with lenses that were estimated, of which the worst counts; else those that were
             given hold on.
     """
-    usual, known = CalibrationErrors(), dict[str, float]()
-    for name in LensErrors._fields:
-        value = getattr(config.calibration, name)
-        if found:
-            value = max(float(getattr(each.lens, name)) for each in found)
-        if found or value != getattr(usual, name):
-            known[f"calibration.{name}"] = float(f"{value:.4g}")
+    errors, known = config.calibration, dict[str, float]()
+    if found or errors != CalibrationErrors():
+        for name in LensErrors._fields:
+            own = [float(getattr(each.lens, name)) for each in found] or [getattr(errors, name)]
+            known[f"calibration.{name}"] = float(f"{max(own):.4g}")
     declared = [each.settings.get("map_deviation", 0.0) for each in maps]
     if map_deviation := config.map_deviation or max(declared, default=0.0):
         known["map_deviation"] = float(f"{map_deviation:.3g}")
@@ -318,8 +314,11 @@ def _deviations(
 
 def _lens_writers(args: Options, cameras: Mapping[str, Camera]) -> Writers:
     """Return what writes the single lenses, if they are wanted."""
-    files = _lens_files(args, list(cameras))
-    return {file: partial(write_calibration, camera=cameras[name]) for name, file in files.items()}
+    return {
+        file: partial(write_calibration, camera=camera)
+        for name, camera in cameras.items()
+        for file in _lens_file(args, name)
+    }
 
 
 def _calibrate_rig(args: Options) -> dict[str, Figures]:
@@ -331,7 +330,7 @@ def _calibrate_rig(args: Options) -> dict[str, Figures]:
     config, recordings, maps = given_settings(args), dict[str, Recording](), list[MarkerMap]()
     cameras = cameras_of(args, args.recordings, config)
     if args.out is not None:
-        lenses = _lens_files(args, list(cameras)).values()
+        lenses = [file for name in cameras for file in _lens_file(args, name)]
         refuse_existing(args, args.out, _beside(args.out, _TRANSFORMS), *lenses)
     intrinsics = False
     for name, (own, _) in cameras.items():
