@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Am I lost? The probability that a pose lies outside its 99.9 % region.
 
-A wrong pose leaves traces in a frame: outliers cluster, and are the same landmarks in the next
-frame; inliers fill only a part of the view. Each trace is a number, and a logistic regression turns
-them into log odds. It was fitted to sequences in right and wrong maps (``python -m
-benchmarks.integrity --fit``). Its odds are tempered, because successive frames err together. If a
-whole map is wrong in the same way, only the first wrong frame shows it: its pose lies where the
-frames before did not predict it. A hidden Markov chain combines both. Its states are: right; wrong,
-and frames show it; wrong since a jump.
+A wrong pose leaves traces in a frame: outliers cluster, and inliers are landmarks of only a part of
+the map. Where matches lie in the image says nothing: wrong ones may lie anywhere. Each trace is a
+number, and a logistic regression turns them into log odds. It was fitted to sequences in right and
+wrong maps (``python -m benchmarks.integrity --fit``). Its odds are tempered, because successive
+frames err together. If a whole map is wrong in the same way, only the first wrong frame shows it:
+its pose lies where the frames before did not predict it. A hidden Markov chain combines both. Its
+states are: right; wrong, and frames show it; wrong since a jump.
 
 No image can show that a room was moved as a whole before the first frame. Neither can an image of
 one wall show that the wall is a copy of another one. Landmarks that have disappeared do not make a
@@ -30,17 +30,17 @@ from rs_localizer.estimation.moved_part import Look, MovedPart, chosen, look_at,
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.native import entry
 
-NAMES = (
-    "share", "together", "apart", "persists", "spread", "filled", "count", "innovation",
-)  # fmt: skip
+NAMES = "apart", "spread", "count", "innovation"
 """Names of the numbers of a frame."""
 # The regression: the constant, then the weights of NAMES; an innovation counts as a jump only.
-WEIGHTS = np.array([1.363, -0.855, 0.011, 0.365, 0.845, -4.351, -0.551, -0.653, 0.0])
+WEIGHTS = np.array([0.863, 0.344, -1.623, -0.226, 0.0])
 # Weight of a frame's log odds beside those of earlier frames; probabilities per frame that a right
 # track goes wrong and that a wrong one recovers; probabilities that a first pose is wrong in either
-# way. A right scene in the middle of the image, with a fifth of its matches wrong, reaches 0.02
-# after ten seconds; with weights that are fitted to single poses it reached 0.78.
-TEMPER, GOES_WRONG, RECOVERS, FIRST = 0.4, 0.001, 0.3, (0.015, 0.005)
+# way.
+TEMPER, GOES_WRONG, RECOVERS, FIRST = 0.4, 0.001, 0.6, (0.015, 0.005)
+# Probability per frame that a track is right again after a jump, unseen: it came back in small
+# steps. Without it, one false alarm would last until the track ends.
+RETURNS = 0.001
 # Log odds that an innovation is a jump to a wrong or a right pose (constant and factor), and the
 # highest probability that a jump may give.
 JUMP, MOST_JUMP = (-15.57, 5.34), 0.65
@@ -74,18 +74,12 @@ def _together(points: Array, kept: BoolArray) -> float:
     return min(max((alike - expected) / deviation, -3.0), 15.0)
 
 
-def _spread(kept: Array, seen: Array) -> float:
-    """Return the logarithm of the part of the points' area in the image that the inliers take."""
+def _spread(kept: Array, every: Array) -> float:
+    """Return the logarithm of how far inliers (m,3) spread in the map, beside all points (n,3)."""
     if len(kept) < 3:
         return -3.0
-    areas = [math.sqrt(max(_determinant(each), 1e-6)) for each in (kept, seen)]
-    return min(max(math.log(areas[0] / areas[1]), -3.0), 1.0)
-
-
-def _determinant(pixels: Array) -> float:
-    """Return the determinant of the covariance of pixels (n,2)."""
-    x, y = (pixels - pixels.mean(axis=0)).T
-    return float((x @ x) * (y @ y) - (x @ y) ** 2) / (len(pixels) - 1) ** 2
+    inner, outer = (max(float(each.var(axis=0).sum()), 1e-12) for each in (kept, every))
+    return min(max(0.5 * math.log(inner / outer), -3.0), 1.0)
 
 
 def _innovation(estimate: Estimate, prior: Prior) -> float:
@@ -110,47 +104,31 @@ def _keys(points: Array) -> Array:
 
 
 class SeenLandmarks:
-    """How often landmarks were seen and matched, and whether in the last frame."""
+    """How often landmarks were seen, and how often they were matched."""
 
     def __init__(self) -> None:
         self._rows: dict[float, int] = {}  # of landmarks, by key
-        # Seen, kept; the last frame with it, and whether it was kept there.
-        self._counts = np.zeros((0, 4))
-        self._frame = 1
+        self._counts = np.zeros((0, 2))  # seen, kept
 
-    def skip(self) -> None:
-        """Let the next frame follow no other."""
-        self._frame += 1
-
-    def add(self, keys: Array, kept: BoolArray) -> Array:
-        """Count the landmarks of a frame.
-
-        Returns:
-            how many (2,2) of them were outliers or inliers in the last frame, and are now.
-        """
+    def add(self, keys: Array, kept: BoolArray) -> None:
+        """Count the landmarks of a frame."""
         rows, known = self._rows, len(self._counts)
         place = np.array([rows.setdefault(key, len(rows)) for key in keys.tolist()], np.int64)
         if len(rows) > known:
             more = max(len(rows) - known, known)
-            self._counts = np.concatenate([self._counts, np.zeros((more, 4))])
-        seen, often, frame, before = self._counts[place].T
-        follows = frame == self._frame
-        pairs = 2 * before[follows].astype(np.int64) + kept[follows]
-        self._frame += 1
-        last = np.full(len(keys), float(self._frame))
-        self._counts[place] = np.column_stack([seen + 1.0, often + kept, last, kept])
+            self._counts = np.concatenate([self._counts, np.zeros((more, 2))])
+        self._counts[place] += np.column_stack([np.ones(len(keys)), kept])
         if len(rows) > _MOST_LANDMARKS:  # those that are not in view
             there = dict.fromkeys(keys.tolist())
             self._counts = self._counts[[rows[key] for key in there]]
             self._rows = {key: row for row, key in enumerate(there)}
-        return np.bincount(pairs, minlength=4).reshape(2, 2)
 
     def stale(self, keys: Array) -> BoolArray:
         """Return which landmarks, by key, were seen too often to be unmatched by chance."""
         place = np.array([self._rows.get(key, -1) for key in keys.tolist()], np.int64)
         found: BoolArray = place >= 0
         if found.any():
-            seen, kept = self._counts[:, :2].T
+            seen, kept = self._counts.T
             missed = 1.0 - kept.sum() / seen.sum()
             found &= ((kept == 0) & (missed**seen < _BY_CHANCE))[place]
         return found
@@ -174,7 +152,6 @@ class Integrity:
         # Probabilities of the three states after the last frame.
         self._chances = np.array([1.0 - sum(FIRST), *FIRST])
         self._is_first = True
-        self._seen.skip()
         self.moved: MovedPart | None = None
         """The part of the map that was last found to lie elsewhere; None: no part was."""
         self._looks: list[Look] = []
@@ -204,49 +181,30 @@ class Integrity:
         """Return which landmarks (n,3) were seen too often to be unmatched by chance."""
         return self._seen.stale(_keys(np.asarray(points, float)))
 
-    def numbers(
-        self, estimate: Estimate, points: ArrayLike, pixels: ArrayLike, prior: Prior | None
-    ) -> Array:
-        """Return the numbers (8,) of the next frame, in the order of ``NAMES``.
+    def numbers(self, estimate: Estimate, points: ArrayLike, prior: Prior | None) -> Array:
+        """Return the numbers (4,) of the next frame, in the order of ``NAMES``.
 
         Args:
             estimate: of the frame.
-            points, pixels: (n,3) m and (n,2) px of its correspondences.
+            points: (n,3) m of its correspondences.
             prior: what the frames before predicted; None: nothing.
         """
-        residuals = np.asarray(estimate.residuals)
-        usable = np.isfinite(residuals)
-        every, seen = np.asarray(points, float)[usable], np.asarray(pixels, float)[usable]
-        kept, residuals = np.asarray(estimate.inliers)[usable], residuals[usable]
+        usable = np.isfinite(np.asarray(estimate.residuals))
+        every, kept = np.asarray(points, float)[usable], np.asarray(estimate.inliers)[usable]
+        self._seen.add(_keys(every), kept)
         inliers = int(kept.sum())
-        share = math.log((inliers + 1.0) / (len(kept) - inliers + 1.0))
-        own = residuals[kept]
-        filled = float(np.mean(own > 0.5 * max(own.max(), 1e-9))) if inliers else 1.0
-        together, persists = _together(every, kept), self._persists(every, kept)
-        outliers = 1.0 / (1.0 + math.exp(share))
+        outliers = (len(kept) - inliers + 1.0) / (len(kept) + 2.0)
         return np.array(
             [
-                share,
-                together,
-                together * outliers,  # less, if few cluster: a person in view
-                persists,
-                _spread(seen[kept], seen),
-                filled,
+                _together(every, kept) * outliers,  # less, if few cluster: a person in view
+                _spread(every[kept], every),
                 math.log(max(inliers - 6.0, 1.0)),
                 0.0 if prior is None else _innovation(estimate, prior),
             ]
         )
 
-    def _persists(self, points: Array, kept: BoolArray) -> float:
-        """Return the log odds, over chance, that landmarks keep being inliers or outliers.
-
-        Chance mismatches differ from frame to frame; a landmark that was moved stays an outlier.
-        """
-        counts = 1.0 + self._seen.add(_keys(points), kept)
-        return float(np.log(counts[0, 0] * counts[1, 1] / (counts[0, 1] * counts[1, 0])))
-
     def add(self, numbers: Array) -> float:
-        """Return the probability that the pose is wrong, after a frame with these numbers (8,)."""
+        """Return the probability that the pose is wrong, after a frame with these numbers (4,)."""
         said = min(max(float(WEIGHTS[0] + WEIGHTS[1:] @ numbers), -_MOST_ODDS), _MOST_ODDS)
         if not self._is_first:
             self._chances = _transitions(float(numbers[INNOVATION])) @ self._chances
@@ -262,9 +220,9 @@ def _transitions(innovation: float) -> Array:
     jump = min(1.0 / (1.0 + math.exp(-odds)), MOST_JUMP)
     stays, goes = 1.0 - GOES_WRONG, GOES_WRONG
     return np.array([
-        [stays * (1.0 - jump), RECOVERS, stays * jump],
+        [stays * (1.0 - jump), RECOVERS, stays * jump + RETURNS],
         [goes, 1.0 - RECOVERS, goes],
-        [stays * jump, 0.0, stays * (1.0 - jump)],
+        [stays * jump, 0.0, stays * (1.0 - jump) - RETURNS],
     ])  # fmt: skip
 
 

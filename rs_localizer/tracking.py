@@ -429,7 +429,7 @@ class Tracker:
             self.shutter.add(time_ns, result, *seen, jumped=jumped)
             self.lens.add(result)
         if result:
-            result = self.shutter.widened(self._judged(result, points, pixels, prior))
+            result = self.shutter.widened(self._judged(result, points, prior))
             if self.remembers_motion:
                 result = self._covering(replace(result, time_ns=time_ns), context)
                 self._remember(time_ns, told, result, context)
@@ -589,13 +589,12 @@ class Tracker:
         self,
         result: Estimate,
         points: ArrayLike | Mapping[str, Sequence[ArrayLike]],
-        pixels: ArrayLike | None,
         prior: Prior | None,
     ) -> Estimate:
         """Return the estimate with its integrity; a rig, and no covariance, give none."""
-        if isinstance(points, Mapping) or pixels is None or np.isnan(result.joint_covariance[0, 0]):
+        if isinstance(points, Mapping) or np.isnan(result.joint_covariance[0, 0]):
             return result
-        numbers = self._integrity.numbers(result, points, pixels, prior)
+        numbers = self._integrity.numbers(result, points, prior)
         return replace(result, integrity=self._integrity.add(numbers))
 
     def _prior(
