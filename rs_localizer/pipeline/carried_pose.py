@@ -237,9 +237,9 @@ class Hypothesis:
         def from_rest(start: CarriedPose, more: float) -> bool:
             steps = start.offset(end, at)
             return any(
-                _surely(start, end, at, steps[part], part, most * seconds**2 + more, 3.0)
-                and not _surely(before, left, left.since, steps[part], part)
-                and not _surely(first, end, at, steps[part], part)
+                _along(steps, part, start, end, at, 3.0) > most * seconds**2 + more
+                and _along(steps, part, before, left, left.since, 2.0) <= 0.0
+                and _along(steps, part, first, end, at, 2.0) <= 0.0
                 for part, most in zip((PLACE, TURN), _SLIDE, strict=True)
             )
 
@@ -247,14 +247,13 @@ class Hypothesis:
         return from_rest(left, 0.0) and from_rest(stayed, float(np.linalg.norm(drove)))
 
 
-def _surely(
-    one: CarriedPose, other: CarriedPose, at: Odometry, way: Array, part: slice,
-    most: float = 0.0, deviations: float = 2.0,
-) -> bool:  # fmt: skip
-    """Return whether two poses lie farther apart along a way (3,) than ``most``, but for noise."""
-    along = way / max(float(np.linalg.norm(way)), 1e-12)
+def _along(
+    steps: Array, part: slice, one: CarriedPose, other: CarriedPose, at: Odometry, slack: float
+) -> float:
+    """Return how far one pose lies from another along steps (6,), less deviations of noise."""
+    along = steps[part] / max(float(np.linalg.norm(steps[part])), 1e-12)
     spread = float(along @ (one.covariance + other.covariance)[part, part] @ along)
-    return float(one.offset(other, at)[part] @ along) > most + deviations * math.sqrt(spread)
+    return float(one.offset(other, at)[part] @ along) - slack * math.sqrt(spread)
 
 
 def _moved(covariance: Array, way: Array) -> Array:
