@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,14 +59,12 @@ def run(options: Options) -> Figures:
     print(f"\n{'error':26}{'count':>6}{'median':>11}{'mean':>11}{'95 %':>11}{'largest':>11}")
     for kind, (_, values) in found.items():
         unit = errors.UNITS[kind]
-        cells = np.nan, np.nan, np.nan, np.nan
-        if len(values):
-            median, p95 = np.percentile(values, [50, 95]).tolist()
-            cells = median, float(np.mean(values)), p95, float(np.max(values))
-        columns = "".join(f"{value:11.5f}" for value in cells)
+        known = values if len(values) else np.full(1, np.nan)
+        median, p95, largest = np.percentile(known, [50, 95, 100]).tolist()
+        columns = "".join(f"{x:11.5f}" for x in (median, float(np.mean(known)), p95, largest))
         print(f"{f'{kind} ({unit})':26}{len(values):6}{columns}")
-        known, suffix = kind.replace(" ", "_"), unit.replace("/", "_per_")
-        figures |= {f"{known}_median_{suffix}": cells[0], f"{known}_p95_{suffix}": cells[2]}
+        name, suffix = kind.replace(" ", "_"), unit.replace("/", "_per_")
+        figures |= {f"{name}_median_{suffix}": median, f"{name}_p95_{suffix}": p95}
     if options.ate:
         for name, value in errors.by_evo(estimate.poses, truth.poses).items():
             print(f"{name:34}{value:11.5f}")
@@ -77,15 +76,11 @@ def run(options: Options) -> Figures:
 
 def _coverage(path: Path, posed: int, met: int, true: int) -> str:
     """Return the share of the truth that has been localized, as a sentence."""
-    try:
-        with open_bag(path) as bag:
-            topics = (CORRESPONDENCES_TOPIC, IMAGE_TOPIC, RAW_IMAGE_TOPIC)
-            of_frames = next((topic for topic in topics if topic in bag.topics), None)
-            frames = bag.count({of_frames}) if of_frames else 0
-    except BagError:  # a text file, or a directory of them
-        frames = 0
-    if frames > 0:  # their truth may stand there for several instants of each
-        return f"{posed} of {frames} frames have a pose"
+    # Of a recording, not of text; the truth may stand there for several instants of each frame.
+    with contextlib.suppress(BagError), open_bag(path) as bag:
+        topics = (CORRESPONDENCES_TOPIC, IMAGE_TOPIC, RAW_IMAGE_TOPIC)
+        if of_frames := next((topic for topic in topics if topic in bag.topics), None):
+            return f"{posed} of {bag.count({of_frames})} frames have a pose"
     return f"{met} of {true} true poses have an estimate"
 
 

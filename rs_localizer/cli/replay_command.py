@@ -23,12 +23,11 @@ from rs_localizer.io.trajectories import POSES_FILE as POSES
 from rs_localizer.io.trajectories import TWISTS_FILE as TWISTS
 
 if WORKING:
-    import numpy as np
     from tqdm import tqdm
 
-    from rs_localizer.config import FeatureKind, ImuUse, NodeConfig
+    from rs_localizer.config import ImuUse, NodeConfig
+    from rs_localizer.features.extraction import kind_of
     from rs_localizer.io.maps.files import read_map_file
-    from rs_localizer.io.maps.landmarks import Map
     from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
     from rs_localizer.io.topics import IMU
     from rs_localizer.markers.map_files import is_marker_file
@@ -42,7 +41,6 @@ if WORKING:
 if TYPE_CHECKING:
     from rs_localizer.cli import detect_command  # of images only
 
-_ORB_BYTES = 32  # of a descriptor; AKAZE's has 61
 # The table of each of many recordings.
 TABLE = "frames.parquet"
 
@@ -145,7 +143,7 @@ def _detection(options: Options, recording: Path, place: Path, out: Path) -> det
             calibration = calibration or place / CAMERA
     return detect_command.Options(
         recording=recording, out=out, map=place if by_markers else None,
-        features=None if by_markers else _features_of(read_map_file(_map_file(place), MAP_FRAME)),
+        features=None if by_markers else kind_of(read_map_file(_map_file(place), MAP_FRAME)),
         calibration=calibration, params=params, assignments=options.assignments,
         remaps=options.remaps, rate=options.rate,
     )  # fmt: skip
@@ -154,15 +152,6 @@ def _detection(options: Options, recording: Path, place: Path, out: Path) -> det
 def _map_file(place: Path) -> Path:
     """Return the file of the landmarks, also in a result of map build."""
     return place / MAP if (place / MAP).is_file() else place
-
-
-def _features_of(landmarks: Map) -> str:
-    if landmarks.descriptors is None:
-        raise ValueError("the map has no descriptors: keypoints of images cannot be matched to it")
-    if landmarks.descriptors.dtype == np.float32:
-        return FeatureKind.SIFT.value
-    orb = landmarks.descriptors.shape[1] == _ORB_BYTES
-    return (FeatureKind.ORB if orb else FeatureKind.AKAZE).value
 
 
 def _replay_matches(options: Options, path: Path, recording: Path, out: Path, timed: bool) -> Tally:

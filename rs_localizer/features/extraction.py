@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from rs_localizer.config import FeatureKind
 from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.io.maps.landmarks import Map
 
+_ORB_BYTES = 32  # of a descriptor; AKAZE's has 61
 # A corner is looked for within this many pixels of FAST's, gradients are summed over as many.
 _REACH = _WINDOW = 1
 # Around a corner: its reach, a neighbour for the parabola, the window, a neighbour for gradients.
@@ -212,6 +214,20 @@ def choose_balanced(pixels: Array, scores: Array, size: tuple[int, int], most: i
     order = np.lexsort((-scores, cells))
     ranks = np.arange(count) - np.searchsorted(cells[order], cells[order])
     return np.sort(order[np.lexsort((-scores[order], ranks))[:most]])
+
+
+def kind_of(landmarks: Map) -> str:
+    """Return the kind of features that match the descriptors of a map.
+
+    Raises:
+        ValueError: for a map without descriptors.
+    """
+    if landmarks.descriptors is None:
+        raise ValueError("the map has no descriptors: keypoints of images cannot be matched to it")
+    if landmarks.descriptors.dtype == np.float32:
+        return FeatureKind.SIFT.value
+    orb = landmarks.descriptors.shape[1] == _ORB_BYTES
+    return (FeatureKind.ORB if orb else FeatureKind.AKAZE).value
 
 
 # OpenCV's detectors fail on smaller images (px), in which there is nothing to find.

@@ -47,7 +47,7 @@ logging.getLogger("distributed").setLevel({_SILENT})
 class Task:
     """One recording, and what its result is made with."""
 
-    work: Callable[[Path, Path], Figures]  # of a recording, and the folder to create
+    work: Callable[[Path, Path], Figures]  # of a recording, and the folder to create; pickled
     recording: Path  # absolute, as the folder: workers are elsewhere
     folder: Path
     settings: str  # version and options, as text
@@ -56,14 +56,7 @@ class Task:
 def tasks_of(
     recordings: Sequence[Path], out: Path, work: Callable[[Path, Path], Figures], settings: str
 ) -> list[Task]:
-    """Return a task for each recording, with a folder of its own below ``out``.
-
-    Args:
-        recordings: to be localized; duplicates are localized once.
-        out: of all results.
-        work: a function that can be pickled.
-        settings: what results are made with beside the recordings.
-    """
+    """Return a task for each different recording, with a folder of its own below ``out``."""
     made = dict[str, Task]()
     places = {path.absolute(): path.name if path.is_dir() else path.stem for path in recordings}
     for place, name in places.items():
@@ -119,10 +112,7 @@ def perform_all(
 ) -> Generator[tuple[Task, Outcome]]:
     """Yield the outcome of each task, as they come; closing the iterator stops all.
 
-    Args:
-        tasks: those that are not done yet.
-        scheduler: address of Dask's; None: on this machine.
-        workers: processes of this machine that Dask starts; None: this process alone.
+    Dask has the scheduler at an address, or starts workers here; without both: this process alone.
 
     Raises:
         ValueError: when no scheduler answers.
@@ -182,11 +172,7 @@ def do_all(
 ) -> dict[Path, Outcome]:  # fmt: skip
     """Return the outcomes by folder; the summary in ``out`` is written however it ends.
 
-    Args:
-        heard: called as tasks end that had not been done before.
-
-    Raises:
-        ValueError: as :func:`perform_all`.
+    ``heard`` is told of tasks that had not been done before. Raises as :func:`perform_all` does.
     """
     with write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
