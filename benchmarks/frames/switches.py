@@ -81,10 +81,7 @@ SWITCHES: dict[str, tuple[Switch, ...]] = {
     "left-out": (Switch("rs_localizer.localizer:left_out", _always(LeftOut())),),
     # Tracking.
     "window": (Switch("rs_localizer.estimation.window:LENGTH", lambda old: 2),),
-    "learnt-accelerations": (
-        Switch("rs_localizer.estimation.window:MotionWindow._learnt",
-               lambda old: lambda self, deviations, scores: deviations),
-    ),
+    "learnt-accelerations": (Switch("rs_localizer.estimation.window:_ROUNDS", lambda old: 0),),
 }  # fmt: skip
 """By the name that ``python -m benchmarks.frames paired without NAME`` takes."""
 
