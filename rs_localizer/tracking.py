@@ -451,22 +451,24 @@ class Tracker:
         Returns:
             what was found, the prior that it was found with, and what its points tell.
         """
-        found, prior, told = Failure(Reason.AWAITS_FRAMES, ""), None, None
-        if foreseen is not None and self.aid is not None:
-            rotation = foreseen.rotation
-            prior = foreseen.prior or self._prior(time_ns, rotation, span, context)
-            found = find(prior, rotation)
-            told = self._told(time_ns, found, prior, rotation)
-            if found and told and self.aid.agrees(foreseen, found, told):
-                return found, prior, told
+        if foreseen is None or self.aid is None:
+            alone = self._prior(time_ns, None, span, context)
+            found = find(alone, None)
+            return found, alone, self._told(time_ns, found, alone, None)
+        rotation = foreseen.rotation
+        prior = foreseen.prior or self._prior(time_ns, rotation, span, context)
+        found = find(prior, rotation)
+        told = self._told(time_ns, found, prior, rotation)
+        if found and told is not None and self.aid.agrees(foreseen, found, told):
+            return found, prior, told
         alone = self._prior(time_ns, None, span, context)
         other = find(alone, None)
-        if foreseen is not None and not other:
+        if not other:
             return found, prior, told
-        known = self._told(time_ns, other, alone, None)
-        if foreseen is not None and self.aid is not None and not found and other and known:
-            self.aid.agrees(foreseen, other, known)
-        return other, alone, known
+        told = self._told(time_ns, other, alone, None)
+        if told is not None and not found:
+            self.aid.agrees(foreseen, other, told)
+        return other, alone, told
 
     def _told(
         self, time_ns: int, found: Estimate | Failure, prior: Prior | None,

@@ -219,11 +219,12 @@ class MotionWindow:
 
     def _through(self, rounds: int) -> MotionWindow:
         """Return the window with the motion by its samples, learning from them in some rounds."""
-        times, *samples = zip(*self.samples, strict=True)
-        seconds = 1e-9 * np.diff(np.array([self.start.time_ns, *times]))
+        _, states, informations, gradients = map(np.array, zip(*self.samples, strict=True))
+        seconds: Array = np.diff(self.times).astype(np.float64) * 1e-9
         solved = _Solved(*_solve(
-            seconds, *map(np.array, samples), self.start.state, self.start.covariance,
-            np.stack([self.configured, self.deviations]), self.readout_share, rounds,
+            seconds, states, informations, gradients, self.start.state,
+            self.start.covariance, np.stack([self.configured, self.deviations]),
+            self.readout_share, rounds,
         ))  # fmt: skip
         return replace(self, deviations=solved.deviations, solved=solved)
 
