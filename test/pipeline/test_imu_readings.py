@@ -177,7 +177,7 @@ def without(start: float, end: float) -> Change:
     return lambda message, time: () if start < time < end else (message,)
 
 
-# What a reading buffer by itself says of others is in test/inertial/test_buffer.py.
+# What the buffer of samples by itself says of others is in test/inertial/test_samples.py.
 FAULTS: dict[str, tuple[Change, ImuReason]] = {
     "stops": (without(1.0, 9.0), ImuReason.STOPPED),
     "begins late": (without(-9.0, 1.0), ImuReason.BEGINS_LATER),
