@@ -223,8 +223,8 @@ def _own_motion(
     size = int(np.count_nonzero(group))
     if _surprise(left, size, _SAMPLE, math.pi * gate**2 / area) < _LEAST_CHANCE:
         return None
-    part = observations.only(np.flatnonzero(group))
-    best = best_motion(part.packed, part.count, own.state, observed.terms, threshold)
+    chosen = observations.only(np.flatnonzero(group))
+    best = best_motion(chosen.packed, chosen.count, own.state, observed.terms, threshold)
     return _Group(group, best.state, observations.squared_errors(best.state))
 
 
