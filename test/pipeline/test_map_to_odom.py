@@ -309,7 +309,8 @@ def test_a_recording_that_starts_over_is_no_jump():
 def test_a_click_begins_where_nothing_is_known():
     drive = Drive()
     drive.go(1.0, poses=False)
-    assert drive.click(x=0.3) == "taken: map -> odom begins with it"
+    for x in (4.0, 0.3):  # the next one replaces what no pose has confirmed
+        assert drive.click(x=x) == "taken: map -> odom begins with it"
     assert drive.decision.standing is Standing.HELD
     assert drive.errors() == pytest.approx((0.3, math.sqrt(0.51)), rel=1e-6)
     drive.go(3.0, poses=False)
@@ -317,13 +318,6 @@ def test_a_click_begins_where_nothing_is_known():
     drive.go(0.1)  # a pose that it allows for takes its place
     assert drive.errors()[0] < 0.05
     assert drive.decision.standing is Standing.TRACKING
-
-
-def test_a_click_that_no_pose_has_confirmed_is_replaced_by_the_next():
-    drive = Drive()
-    for x in (4.0, -0.3):
-        assert drive.click(x=x) == "taken: map -> odom begins with it"
-        assert drive.errors()[0] == pytest.approx(abs(x))
 
 
 def test_a_click_counts_by_its_covariance():
@@ -376,9 +370,17 @@ def test_the_covariance_of_the_transform_gives_that_of_the_body_back():
     assert np.cov(np.transpose(drawn)) == pytest.approx(expected, abs=0.05 * expected.max())
 
 
-def test_in_the_plane_it_is_as_sure_as_of_x_and_y_and_heading():
-    covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
-    for two_d, expected in ((True, [1, 2, 0, 0, 0, 6]), (False, [1, 2, 3, 4, 5, 6])):
-        pose = FoundPose(Odometry(SECOND, place(0, 0, 0)), place(1, 0, 0), covariance)
-        decision = decide(Settings(two_d=two_d), CorrectionState(), pose)
-        assert decision.covariance.diagonal() == pytest.approx(expected)
+@pytest.mark.parametrize("two_d", [True, False])
+def test_in_the_plane_the_body_has_its_x_and_y_and_heading(two_d):
+    tilted = Transform(
+        Rotation.from_euler("zyx", [0.7, 0.02, -0.03]).as_matrix(), np.array([3.0, 4.0, 0.2])
+    )
+    odometry, covariance = place(-1.0, 2.0, 0.4), np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    seen = FoundPose(Odometry(SECOND, odometry), tilted, covariance)
+    decision = decide(Settings(two_d=two_d), CorrectionState(), seen)
+    body, flat = decision.map_from_odom @ odometry, place(3.0, 4.0, 0.7)
+    expected = flat if two_d else tilted
+    assert body.translation == pytest.approx(expected.translation)
+    assert body.rotation == pytest.approx(expected.rotation, abs=2e-3 if two_d else 1e-9)
+    sure = [1, 2, 0, 0, 0, 6] if two_d else [1, 2, 3, 4, 5, 6]
+    assert decision.covariance.diagonal() == pytest.approx(sure)
