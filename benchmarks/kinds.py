@@ -188,7 +188,7 @@ def stretched(share: float, seen: Seen, rng: np.random.Generator) -> Seen:
     return seen._replace(points=seen.points + share * (away @ along)[:, None] * along)
 
 
-def _kinds() -> list[Kind]:
+def kinds() -> list[Kind]:
     """The rows, a control of each scene before its faults."""
     well = NodeConfig(calibration=_WELL)
     return [
@@ -352,7 +352,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--say", action="store_true", help="also what was said last, of each name")
     options = parser.parse_args(arguments)
     rows = []
-    for kind in _kinds():
+    for kind in kinds():
         if not all(word in kind.name for word in options.only):
             continue
         for seed in options.seeds:

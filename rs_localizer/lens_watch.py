@@ -3,17 +3,27 @@
 """Whether frames contradict what is said of lens and map: given deviations are promises.
 
 What one frame leaves may be chance, what all of them leave is not. A lens that belongs to another
-image before one wall is seen in some frames only: where the camera looks at it aslant.
+image before one wall is seen in some frames only: where the camera looks at it aslant. Before a
+board none shows it, because motion takes up what it leaves; three frames together do
+(:mod:`.frames_together`).
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
+from rs_localizer.config import LocalizerConfig
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.reasons import Reason
+from rs_localizer.core.rig import Exposure
+from rs_localizer.core.scanning import VERTICAL
+from rs_localizer.core.state import ANGULAR
 from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.estimation.frames_together import FRAMES, Fitted, Matrix, another_matrix
 
 # Frames of which the median counts.
 _FRAMES = 15
@@ -25,38 +35,92 @@ _OF_DISTORTION = 0.6
 # So many of so many frames that another camera matrix explains are no chance: of twelve real boards
 # none has one.
 _OTHERS, _OF_THE_LAST = 3, 30
+# Frames are compared again after as many as before, and after so many at most: it takes 10 ms. Of
+# the last comparisons two must agree in another matrix to this part: three frames of a stabilized
+# film turn alike, too. Until then a focal length, as long as no comparison denies it, is believed.
+_RARELY, _COMPARISONS, _ALIKE = 48, 3, 0.2
+# Frames whose shares of inliers differ more show different parts of the map.
+_SAME_SHARE = 0.8
+# Intervals (s) over which a parabola is a hand's motion.
+_LONGEST_INTERVAL = 0.15
+# Beyond this (logarithm) fy over fx is not the image's, and no pose is told.
+_MOST_SQUEEZED = 0.05
 
 
 class LensWatch:
-    """Compares smooth errors with what is declared; see the module.
+    """Compares smooth errors, and the motions between frames, with what is declared.
 
     Args:
-        distortion: its deviation, px at the corners.
+        exposure: of a camera alone that moves while rows are read; None: motions are not compared.
+        config: with the deviations of calibration and map.
     """
 
-    def __init__(self, distortion: float) -> None:
-        self._least = _OF_DISTORTION * distortion
+    def __init__(self, exposure: Exposure | None, config: LocalizerConfig) -> None:
+        self._least = _OF_DISTORTION * config.calibration.distortion
+        self._exposure, self._threshold = exposure, config.inlier_threshold
+        self._declared = config.calibration.aspect_ratio, config.map_deviation
         self.reset()
 
     def reset(self) -> None:
         """Forget all frames."""
-        self.fault = ""
-        """How the last frames contradict what is declared, in one sentence."""
+        self._smooth = ""
         self._sizes: deque[tuple[float, float]] = deque(maxlen=_FRAMES)
         self._others: deque[str] = deque(maxlen=_OF_THE_LAST)
+        self._posed: deque[Fitted] = deque(maxlen=FRAMES)
+        self._found: deque[Matrix | None] = deque(maxlen=_COMPARISONS)
+        self._squeeze = 0.0  # logarithm of fy over fx, over K's, as it was last found
+        self._count, self._next = 0, FRAMES
+
+    @property
+    def matrix(self) -> Matrix | None:
+        """The camera matrix that the last frames show instead of K; None: K may be right."""
+        last = self._found[-1] if self._found else None
+        if last and last.focal_length != 1.0:
+            return last
+        found = [np.log(matrix) for matrix in self._found if matrix]
+        if len(found) < 2 or not _agree(found[-1], found[-2]):
+            return None
+        return [matrix for matrix in self._found if matrix][-1]
+
+    @property
+    def fault(self) -> str:
+        """How the last frames contradict what is declared, in one sentence."""
+        return self._smooth if self.matrix is None else str(self.matrix)
 
     @property
     def refusal(self) -> str:
         """Why no pose can be told: K is that of another image."""
+        if (matrix := self.matrix) is not None:
+            off = abs(math.log(matrix.aspect_ratio)) > _MOST_SQUEEZED
+            if off or matrix.focal_length != 1.0:
+                return str(matrix)
         others = [text for text in self._others if text]
         return others[-1] if len(others) >= _OTHERS else ""
 
-    def add(self, found: Estimate | Failure) -> None:
-        """Take a frame of a camera alone, as it was localized."""
+    def widened(self, found: Estimate) -> Estimate:
+        """Return a frame with a covariance that allows for a matrix that was found, if only once.
+
+        A camera whose fy over fx is off by ``s`` reads that as a pitch rate of ``s`` times the
+        height over the focal length.
+        """
+        if not self._squeeze or self._exposure is None:
+            return found
+        (camera,) = self._exposure.cameras
+        axis = int(camera.scan_direction not in VERTICAL)
+        rate = self._squeeze * camera.size[1 - axis] / camera.focal_length
+        calibration = found.calibration_covariance.copy()
+        calibration[ANGULAR, ANGULAR][axis, axis] += rate**2
+        return replace(found, calibration_covariance=calibration)
+
+    def add(self, time_ns: int, found: Estimate | Failure, points: Array, pixels: Array) -> None:
+        """Take a frame of a camera alone, whose middle row was exposed then, as it was found."""
         if not found:
             self._others.append(found.detail if found.reason is Reason.CALIBRATION else "")
             return
         self._others.append("")
+        if found.residual_rms > self._threshold:  # of errors that nobody knows
+            self._posed.clear()
+        self._compare(Fitted(time_ns, found, points, pixels))
         if len(found.shake):  # vibration moves points smoothly, too
             return
         self._sizes.append((found.model_error, found.declared_error))
@@ -64,7 +128,7 @@ class LensWatch:
             return
         off, declared = np.median(self._sizes, axis=0)
         allowed = self._allowed(declared)
-        self.fault = (
+        self._smooth = (
             f"residuals vary smoothly over the image ({off:.2g} px rms), more than the deviations "
             f"of calibration and map allow ({allowed:.2g} px): is the image of another mode or "
             "resolution, rectified or stabilized, or of another camera, or is the map off? "
@@ -73,6 +137,27 @@ class LensWatch:
             else ""
         )
 
+    def _compare(self, frame: Fitted) -> None:
+        """Compare the last frames with each other, now and then."""
+        if self._exposure is None:
+            return
+        seconds = 1e-9 * (frame.time_ns - self._posed[-1].time_ns) if self._posed else 0.0
+        if self._posed and not 0.0 < seconds < _LONGEST_INTERVAL:
+            self._posed.clear()
+        self._posed.append(frame)
+        self._count += 1
+        if len(self._posed) < FRAMES or self._count < self._next:
+            return
+        shares = [float(np.mean(each.found.inliers)) for each in self._posed]
+        if min(shares) < _SAME_SHARE * max(shares):
+            return
+        found = another_matrix(self._exposure, self._posed, *self._declared)
+        self._found.append(found)
+        if found:
+            self._squeeze = math.log(found.aspect_ratio)
+        doubtful = sum(matrix is not None for matrix in self._found) == 1
+        self._next = self._count + (FRAMES if doubtful else min(self._count, _RARELY))
+
     def is_beyond(self, found: Estimate) -> bool:
         """Return whether one frame's smooth error is beyond what is declared."""
         return found.model_error > self._allowed(found.declared_error)
@@ -80,3 +165,8 @@ class LensWatch:
     def _allowed(self, declared: float) -> float:
         """Return the largest smooth error (px, rms) that deviations allow."""
         return max(_BEYOND * declared, self._least)
+
+
+def _agree(one: Array, other: Array) -> bool:
+    """Return whether two matrices (2,) are off alike; logarithms of parts of K."""
+    return bool(np.linalg.norm(one - other) < _ALIKE * np.linalg.norm(one))

@@ -14,10 +14,9 @@ map and lens, which is alike in neighbouring frames. A Kalman filter estimates `
 evidence fades, and both ``m``, which wander. The right shutter is ``(T, 0)``, a global one ``(0,
 0)``, a reversed one ``(-T, 0)``; off the first axis the shutter runs along the other one.
 
-Two faults are no shutter's, by the rotation ``r`` within the rows beside that between images. If
-the images are squeezed (fy over fx), ``r`` is the same in all of them. If the film is stabilized,
-each image was turned as a whole: ``r`` changes smoothly about zero, and its sum is the angle that
-poses are off by.
+A fault that is no shutter's shows in the rotation ``r`` within the rows beside that between images.
+If the film is stabilized, each image was turned as a whole: ``r`` changes smoothly about zero, and
+its sum is the angle that poses are off by.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from rs_localizer.core.lens import centre_of
 from rs_localizer.core.rig import Rig
 from rs_localizer.core.scanning import ACROSS, REVERSED, ScanDirection
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.state import ANGULAR, MOTION_PARAMETERS, POSE, TURN, VELOCITIES
+from rs_localizer.core.state import MOTION_PARAMETERS, POSE, TURN, VELOCITIES
 from rs_localizer.core.types import Estimate, Failure, roughness
 from rs_localizer.estimation.points import find_usable, packed
 from rs_localizer.estimation.prior import state_in
@@ -82,11 +81,6 @@ _GLOBAL = 0.2
 # of so many at least, neighbours correlate by more than this. Vibration changes its sign from frame
 # to frame, unless it has the images' rate.
 _TAKEN_OUT, _LAST, _LEAST, _SMOOTHLY = 3.5 * _LIKE_MOTION, 30, 12, 0.6
-# They are squeezed if it is the same in so many, with such odds (logarithm) against the best
-# shutter: before a camera that turns steadily both are one thing. No frame tells a rotation better
-# than to this (rad). Beyond this share K is not the image's, and no pose is told.
-_FEW, _SQUEEZED, _LEAST_ROTATION, _MOST_SQUEEZED = 6, 12.0, 0.001, 0.05
-_VERTICAL = (ScanDirection.TOP_TO_BOTTOM, ScanDirection.BOTTOM_TO_TOP)
 # Logarithms of the odds of another shutter at which it is doubted, no longer doubted (a robot that
 # drives slowly shows neither) and certain, and of rest before a global shutter.
 _SUSPICIOUS, _SHOWN, _CERTAIN, _AT_REST = 4.0, -2.0, 8.0, 20.7
@@ -165,15 +159,18 @@ class ShutterWatch:
         self._reversed = False  # they may run the other way
         self._across = False  # or along the other axis
         self._looks: deque[_Look] = deque(maxlen=3)
-        # What the last images turn within their rows beside the motion between them, and as that
-        # says, rad per readout.
-        self._beside: deque[tuple[Array, Array]] = deque(maxlen=_LAST)
-        self._squeeze = np.zeros(3)  # rad per readout, by which all of them turn too much
+        # What images turn within their rows beside the motion between them, rad per readout
+        self._beside: deque[Array] = deque(maxlen=_LAST)
         self._taken_out = np.zeros((3, 3))  # rad^2, of the angles that a stabilizer takes out
         self._frames = 0
         if self._camera is not None:
             self._mean, self._covariance = np.zeros(14), self._any
             self._unlike = 1.0  # by how much the square of what wanders is more than usual
+
+    @property
+    def watches(self) -> bool:
+        """Whether there is a shutter to compare."""
+        return self._camera is not None
 
     @property
     def of_rest(self) -> float:
@@ -182,10 +179,9 @@ class ShutterWatch:
 
     def widened(self, found: Estimate) -> Estimate:
         """Return the last frame with a covariance that allows for what the watch has found."""
-        if self._taken_out.any() or self._squeeze.any():
+        if self._taken_out.any():
             calibration = found.calibration_covariance.copy()
             calibration[TURN, TURN] += self._taken_out
-            calibration[ANGULAR, ANGULAR] += np.outer(self._squeeze, self._squeeze)
             found = replace(found, calibration_covariance=calibration)
         if not (self._reversed or self._across):
             return found
@@ -291,61 +287,23 @@ class ShutterWatch:
         self._mean, self._covariance = (prior + step)[6:], covariance[6:, 6:]
         own = np.r_[0:6, 8:11]  # the pose's error, and the rotation over the rows
         left = weighed[own] @ (now.off - self._camera.readout_time * design[:, 6])
-        beside = np.linalg.solve(weighed[own] @ design[:, own], left)[6:]
-        self._beside.append((beside, self._camera.readout_time * speed[:3]))
+        self._beside.append(np.linalg.solve(weighed[own] @ design[:, own], left)[6:])
         changed = float(np.mean(step[8:] ** 2 / wanders.diagonal()))
         changed = min(changed, _MOST_UNLIKELY * self._unlike)
         self._unlike = max(self._unlike + _LEARNING * (changed - self._unlike), 1.0)
-        self._taken_out[:] = self._squeeze[:] = 0.0
+        self._taken_out[:] = 0.0
         usual = self._camera.readout_time
-        sideways = self._far(0.0, math.copysign(usual, self._along(1).readout_time))
-        if sideways - self._far(usual, 0.0) > _SUSPICIOUS and self._squeezes(0.5 * seconds):
-            self.trusted, self._reversed, self._across = True, False, False
-        elif self._unlike < _SHAKEN and np.all(np.abs(self._mean[:2]) < 0.55 * seconds):
+        if self._unlike < _SHAKEN and np.all(np.abs(self._mean[:2]) < 0.55 * seconds):
             self._judge(usual)
-        elif self.kind in ("", "stabilized", "squeezed"):
+        elif self.kind in ("", "stabilized"):
             self.trusted, self._reversed, self._across = True, False, False
             self._judge_stabilizer(0.5 * seconds)
-
-    def _squeezes(self, interval: float) -> bool:
-        """Judge whether all images turn alike beside their motion, as no shutter lets them.
-
-        A camera whose fy over fx is off by ``s`` reads that as a pitch rate of ``s`` times the
-        height over the focal length. The best shutter explains a part that grows with the motion.
-        """
-        assert self._camera is not None
-        axis = int(self._direction not in _VERTICAL)  # about which a squeeze looks like a rotation
-        beside, motion = np.swapaxes(self._beside, 0, 1)[:, :, axis]
-        usual, mean, count = self._camera.readout_time, float(beside.mean()), len(beside)
-        squared = float(np.sum((beside - mean) ** 2))
-        variance = max(squared / count, _LEAST_ROTATION**2)
-        # The share of the motion that another shutter shows, beside a usual error of map and lens.
-        common = count**2 / (count + variance / _LIKE_MOTION**2)
-
-        def product(one: Array, other: Array) -> float:
-            return float(one @ other - common * one.mean() * other.mean())
-
-        share = product(beside, motion) / max(product(motion, motion), variance)
-        left = beside - min(max(share, -2.0), interval / usual - 1.0) * motion
-        odds = 0.5 * (product(left, left) - squared) / variance
-        if count < _FEW or not (abs(mean) > _TAKEN_OUT and odds > _SQUEEZED):
-            return False
-        squeeze = abs(mean) * self._camera.focal_length / self._camera.size[1 - axis]
-        self._squeeze[axis] = mean
-        self.kind, self.error = "squeezed", 0.0
-        self.fault = (
-            f"all images turn by {math.degrees(abs(mean) / usual):.0f} deg/s more within their "
-            "rows than from one to the next, which no shutter does: are they squeezed by "
-            f"{100.0 * squeeze:.0f} % (fy over fx), or is K or the map off?"
-        )
-        self.refusal = self.fault if squeeze > _MOST_SQUEEZED else ""
-        return True
 
     def _judge_stabilizer(self, interval: float) -> None:
         """Judge whether images are turned as a whole: no shutter turns them as they are."""
         assert self._camera is not None
         per_frame = interval / self._camera.readout_time
-        beside = per_frame * np.array([beside for beside, _ in self._beside])
+        beside = per_frame * np.array(self._beside)
         beside -= beside.mean(axis=0)
         angles, square = np.cumsum(beside, axis=0), float(np.sum(beside**2))
         turned = math.sqrt(square / len(beside))  # rad per frame

@@ -158,12 +158,12 @@ class Tracker:
         self._seen: deque[_Seen] = deque(maxlen=LENGTH)  # the newest last
         self._images = RepeatedImages()
         self.shutter = self._watch()
-        self.lens = LensWatch(localizer.config.calibration.distortion)
         self.repeats = False  # whether the last frame shows an image that had come before
         self._track: _Track | None = None
         self._given: tuple[int, Prior] | None = None
         rig = localizer.rig
         alone = rig.exposure().ahead() if len(rig.cameras) == 1 else None
+        self.lens = LensWatch(alone if self.shutter.watches else None, localizer.config)
         self._integrity = Integrity(alone, localizer.config.map_deviation)
         self._last_ns: int | None = None
         self._too_close = 0
@@ -365,9 +365,7 @@ class Tracker:
     def _accepted(self, found: Estimate | Failure) -> Estimate | Failure:
         """Return the estimate, or the reason why it is not published."""
         if found and self.shutter.refusal:
-            of_axis = self.shutter.kind == "axis"
-            reason = Reason.SCAN_AXIS if of_axis else Reason.CALIBRATION
-            return Failure(reason, self.shutter.refusal)
+            return Failure(Reason.SCAN_AXIS, self.shutter.refusal)
         if found and self.lens.refusal:
             return Failure(Reason.CALIBRATION, self.lens.refusal)
         return self.localizer.accepted(found)
@@ -426,10 +424,12 @@ class Tracker:
         if pixels is not None:  # of a camera alone
             jumped = self._has_jumped(time_ns, prior, result)
             seen = np.asarray(points, float), np.asarray(pixels, float)
-            self.shutter.add(time_ns, result, *seen, jumped=jumped)
-            self.lens.add(result)
+            self.lens.add(time_ns, result, *seen)
+            if self.lens.matrix is None:
+                self.shutter.add(time_ns, result, *seen, jumped=jumped)
         if result:
-            result = self.shutter.widened(self._judged(result, points, prior))
+            result = self.lens.widened(self._judged(result, points, prior))
+            result = self.shutter.widened(result)
             if self.remembers_motion:
                 result = self._covering(replace(result, time_ns=time_ns), context)
                 self._remember(time_ns, told, result, context)

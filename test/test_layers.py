@@ -34,7 +34,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "localizer": {"core", "config", "solvers", "estimation"},
     "integrity": {"core", "estimation", "native"},
     "repeated_images": {"core", "estimation"},
-    "lens_watch": {"core"},
+    "lens_watch": {"core", "config", "estimation"},
     "shutter_watch": {"core", "estimation"},
     "tracking": METHOD - {"tracking", "inertial"},
     "io": {"core"},

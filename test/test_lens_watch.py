@@ -9,7 +9,8 @@ import pytest
 
 import rs_localizer as rsl
 from benchmarks.frames.gross import frame
-from rs_localizer.config import CalibrationErrors
+from benchmarks.kinds import judged, kinds
+from rs_localizer.config import CalibrationErrors, LocalizerConfig
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.types import Failure
 from rs_localizer.lens_watch import LensWatch
@@ -45,16 +46,36 @@ def test_a_calibration_is_held_to_what_it_promises():
 
 
 def test_three_frames_that_another_matrix_explains_refuse_all_until_they_are_old():
-    watch, other = LensWatch(0.5), Failure(Reason.CALIBRATION, "K is that of another image")
+    watch = LensWatch(None, LocalizerConfig())
+    other = Failure(Reason.CALIBRATION, "K is that of another image")
     random = np.random.default_rng(1)
-    camera, points, pixels, _ = frame("volume", "right", random)
-    found = rsl.Localizer(camera).localize(points, pixels)
+    camera, *seen, _ = frame("volume", "right", random)
+    found = rsl.Localizer(camera).localize(*seen)
     for _ in range(3):
         assert watch.refusal == ""
-        watch.add(other)
-        watch.add(found)
-        watch.add(replace(other, reason=Reason.UNCERTAIN))
+        watch.add(0, other, *seen)
+        watch.add(0, found, *seen)
+        watch.add(0, replace(other, reason=Reason.UNCERTAIN), *seen)
     assert watch.refusal == other.detail
     for _ in range(30):
-        watch.add(found)
+        watch.add(0, found, *seen)
     assert watch.refusal == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "published", "said"),
+    [
+        ("right: board", 110, ""),
+        ("f of 1.9 times, board", 12, "a focal length 0.5"),
+        ("squeezed by 2 %, corner", 110, "fy over fx 0.98 times K's"),
+        ("squeezed by 25 %, corner", 12, "fy over fx 0.75 times K's"),
+    ],
+)
+def test_what_motion_hides_within_a_frame_three_frames_together_tell(name, published, said):
+    """Of 120 frames; of the three that the first comparison takes, nobody knows."""
+    (kind,) = [kind for kind in kinds() if kind.name == name]
+    tallies = [judged(kind, seed) for seed in (3, 4)]
+    count = sum(tally.published for tally in tallies)
+    assert (count >= published) == (published > 60)
+    texts = [text for tally in tallies for text in tally.texts.values() if "successive" in text]
+    assert any(said in text for text in texts) if said else not texts

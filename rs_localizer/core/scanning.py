@@ -16,6 +16,9 @@ class ScanDirection(StrEnum):
     RIGHT_TO_LEFT = "right_to_left"
 
 
+VERTICAL = ScanDirection.TOP_TO_BOTTOM, ScanDirection.BOTTOM_TO_TOP
+"""Directions along the columns of the image."""
+
 REVERSED = {
     ScanDirection.TOP_TO_BOTTOM: ScanDirection.BOTTOM_TO_TOP,
     ScanDirection.BOTTOM_TO_TOP: ScanDirection.TOP_TO_BOTTOM,

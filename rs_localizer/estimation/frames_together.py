@@ -1,0 +1,273 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Another camera matrix than K, from a few frames together.
+
+Within one frame before a plane, motion takes up what a wrong focal length leaves. Between frames
+the same camera moves: a parabola through the poses of three frames is how it moves within the
+middle one. So each frame has a pose only, and all of them share
+
+    the readout time, the focal length, and fy over fx,
+
+as parts of what is given. A readout time that is off is no fault of K and is left free; with it
+six frames tell a focal length to some 0.2 %.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.lens import centre_of
+from rs_localizer.core.rig import Exposure
+from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.points import Observations, find_usable, packed
+from rs_localizer.estimation.projection import linearized
+
+FRAMES = 3
+"""Frames that are compared: through them goes one parabola."""
+# Points of a frame: more take longer than they are worth.
+_MOST = 60
+# Steps of Gauss and Newton, the last of which moves no number and no angle by more than this.
+_ROUNDS, _LEAST_STEP = 12, 1e-4
+_LEAST_NOISE = 0.1  # px, no real error is smaller
+# Focal lengths from which the search also starts, over K's.
+_LENGTHS = (0.6, 1.7)
+# The largest step of a number: beyond it the linear terms no longer hold.
+_MOST_STEP = 0.3
+# Deviations of readout time, focal length (logarithm) and fy over fx (logarithm) of any camera.
+_OTHER = np.array([3.0, 1.0, 0.1])
+# Deviation of the focal length of this very camera: also of one that is bent or lies before a map
+# that is (:mod:`.left_out`).
+_USUAL = 0.01
+# No fy over fx is known better than to this.
+_EXACT = 1e-4
+# Gain in the logarithm of the evidence for each point and frame, from which another matrix is
+# believed: right ones gain 0.0, boards of paper at most 0.27 (12 videos), wrong ones 2 to 9.
+_EACH = 1.0
+# fy over fx changes as each changes by a half, the other way.
+_NUMBERS, _ASPECT = 3, np.array([-0.5, 0.5])
+
+
+class Fitted(NamedTuple):
+    """A frame with a pose."""
+
+    time_ns: int
+    found: Estimate
+    points: Array  # (n,3)
+    pixels: Array  # (n,2)
+
+
+class Matrix(NamedTuple):
+    """Another camera matrix, beside K."""
+
+    focal_length: float  # over K's
+    aspect_ratio: float  # fy over fx, over K's
+
+    def __str__(self) -> str:
+        named = [
+            f"{name} {value:.3g} times K's"
+            for name, value in (
+                ("a focal length", self.focal_length),
+                ("fy over fx", self.aspect_ratio),
+            )
+            if value != 1.0
+        ]
+        return (
+            f"successive images fit a camera with {' and '.join(named)}: is K that of another "
+            "resolution or of a zoomed, squeezed or rectified image, was only its size edited, or "
+            "is the map off?"
+        )
+
+
+class _Linked(NamedTuple):
+    """A frame on its way; the motion within it is that through the poses of two others."""
+
+    seen: Observations
+    others: tuple[int, int]
+    slopes: Array  # (2,2) velocity and acceleration by the ways to the others, per readout
+
+
+class _Fit(NamedTuple):
+    """What a camera leaves."""
+
+    poses: list[tuple[Array, Array]]  # rotation (3,3) camera_from_map and centre (3,)
+    numbers: Array  # (3,) beside those that are given
+    squared_errors: Array  # (n,) px^2
+
+
+@np.errstate(all="ignore")  # a start that leads nowhere
+def another_matrix(
+    exposure: Exposure, posed: Sequence[Fitted], aspect_ratio: float, map_deviation: float
+) -> Matrix | None:
+    """Return the matrix that frames tell to be the camera's instead of K; None: K may be right.
+
+    Args:
+        exposure: of a camera alone that moves while rows are read.
+        posed: of three frames, in their order.
+        aspect_ratio: declared deviation of fy over fx.
+        map_deviation: m, as declared.
+    """
+    centre = np.median(posed[0].points, axis=0)
+    frames = _frames(exposure, posed, centre)
+    poses = [(each.found.rotation, each.found.position - centre) for each in posed]
+    own = np.concatenate([each.found.residuals[each.found.inliers] for each in posed])
+    depth = np.median(frames[0].seen.points @ poses[0][0][2]) - poses[0][0][2] @ poses[0][1]
+    of_map = map_deviation * exposure.cameras[0].focal_length / float(depth)
+    least = _LEAST_NOISE**2 + of_map**2
+    most = math.exp(_EACH) * max(_variance(own**2), least)
+    size = 6 * len(frames) + 1
+    given = _fitted(frames, _Fit(poses, np.zeros(_NUMBERS), np.zeros(0)), 1)
+    fits = [_fitted(frames, given, _NUMBERS)]
+    if _variance(given.squared_errors) > most:  # or each frame hides what is wrong
+        camera = exposure.cameras[0]
+        middles = np.zeros(2), centre_of(camera) / camera.focal_length
+        starts = [given, *(_scaled(poses, length) for length in _LENGTHS)]
+        fits += [_fitted(frames, start, _NUMBERS, each) for each in middles for start in starts]
+    other = max(fits, key=lambda fit: _evidence(fit, size + 2, least))
+    if not _variance(other.squared_errors) < most:  # it leaves more than frames do
+        return None
+    off, usual = other.numbers[1:], np.array([_USUAL, max(aspect_ratio, _EXACT)])
+    told = 0.5 * ((off / usual) ** 2 - (off / _OTHER[1:]) ** 2) > np.log(_OTHER[1:] / usual)
+    gain = _evidence(other, size + 2, least) - _evidence(given, size, least)
+    if not (told.any() and gain > _EACH * len(other.squared_errors)):  # NaN is not
+        return None
+    length, aspect = np.where(told, np.exp(off), 1.0).tolist()
+    return Matrix(length, aspect)
+
+
+def _scaled(poses: Sequence[tuple[Array, Array]], length: float) -> _Fit:
+    """Return a start with another focal length: the points are so much farther away."""
+    away = [
+        (rotation, rotation.T @ ((rotation @ place) * [1.0, 1.0, length]))
+        for rotation, place in poses
+    ]
+    return _Fit(away, np.array([0.0, math.log(length), 0.0]), np.zeros(0))
+
+
+def _frames(exposure: Exposure, posed: Sequence[Fitted], centre: Array) -> list[_Linked]:
+    times = np.array([1e-9 * (each.time_ns - posed[0].time_ns) for each in posed]) / exposure.span
+    frames = []
+    for k, each in enumerate(posed):
+        some = np.flatnonzero(each.found.inliers)
+        some = some[:: 1 + len(some) // _MOST]
+        points, pixels = map(np.ascontiguousarray, (each.points[some], each.pixels[some]))
+        usable = find_usable(exposure, points, pixels, [len(pixels)], None)
+        near = usable._replace(centre=centre)
+        middle = min(max(k, 1), len(posed) - 2)
+        others = sorted({middle - 1, middle, middle + 1} - {k})
+        away = times[others] - times[k]
+        slopes = np.linalg.inv(np.column_stack([away, 0.5 * away**2]))
+        frames.append(_Linked(packed(exposure, points, near), (others[0], others[1]), slopes))
+    return frames
+
+
+def _fitted(frames: Sequence[_Linked], start: _Fit, free: int, middle: Array | None = None) -> _Fit:
+    """Return the fit of poses and of the first so many numbers.
+
+    ``middle`` (2,): the principal point, in focal lengths, which moves with the focal length if the
+    image has another size; None or zero: it does not.
+    """
+    middle = np.zeros(2) if middle is None else middle
+    fit, size = start, 6 * len(frames)
+    for _ in range(_ROUNDS):
+        lines = [_linearized(frames, fit, k, middle) for k in range(len(frames))]
+        variance = _variance(_squared(lines))
+        known = np.r_[np.zeros(size), variance / _OTHER[:free] ** 2]
+        information = np.diag(known)
+        slope = known * np.r_[np.zeros(size), fit.numbers[:free]]
+        for errors, columns in lines:
+            rows = columns[:, :, : size + free]
+            near = np.isfinite(rows).all(axis=(1, 2)) & np.isfinite(errors).all(axis=1)
+            off, rows = errors[near], rows[near].reshape(-1, size + free)
+            weights = 1.0 / (1.0 + np.square(off).sum(axis=1) / (9.0 * variance))
+            weighed = rows.T * np.repeat(weights, 2)
+            information += weighed @ rows
+            slope += weighed @ off.ravel()
+        try:
+            step = -np.linalg.solve(information, slope)
+        except np.linalg.LinAlgError:
+            break
+        numbers = fit.numbers.copy()
+        numbers[:free] += np.clip(step[size:], -_MOST_STEP, _MOST_STEP)
+        poses = [
+            (np.ascontiguousarray(so3.exp(-turn) @ rotation), place + rotation.T @ move)
+            for (rotation, place), (turn, move) in zip(
+                fit.poses, step[:size].reshape(-1, 2, 3), strict=True
+            )
+        ]
+        fit = _Fit(poses, numbers, fit.squared_errors)
+        if (
+            max(np.abs(step[size:]).max(), np.abs(step[:size].reshape(-1, 6)[:, :3]).max())
+            < _LEAST_STEP
+        ):
+            break
+    lines = [_linearized(frames, fit, k, middle) for k in range(len(frames))]
+    return fit._replace(squared_errors=_squared(lines))
+
+
+def _squared(lines: Sequence[tuple[Array, Array]]) -> Array:
+    """Return the squared errors of all frames' points; infinite where there are none."""
+    squared = np.concatenate([np.square(errors).sum(axis=1) for errors, _ in lines])
+    return np.where(np.isnan(squared), np.inf, squared)
+
+
+def _variance(squared: Array) -> float:
+    """Return the variance (px^2) of one coordinate, by the median of squared errors."""
+    return max(float(np.median(squared)) / 1.386, _LEAST_NOISE**2)
+
+
+def _linearized(frames: Sequence[_Linked], fit: _Fit, k: int, middle: Array) -> tuple[Array, Array]:
+    """Return errors (n,2) of a frame, and their derivatives (n,2,m) by all poses and numbers."""
+    frame, (rotation, place) = frames[k], fit.poses[k]
+    turns = [rotation @ fit.poses[other][0].T for other in frame.others]
+    ways = np.array([
+        np.r_[so3.log(np.ascontiguousarray(turn)), rotation @ (fit.poses[other][1] - place)]
+        for turn, other in zip(turns, frame.others, strict=True)
+    ])  # fmt: skip
+    readout = 1.0 + fit.numbers[0]
+    scale = np.exp(fit.numbers[1] + fit.numbers[2] * _ASPECT)
+    length = math.exp(fit.numbers[1])
+    shift = (length - 1.0) * middle
+    seen, per_time = frame.seen, readout ** np.array([1.0, 2.0])
+    through = Observations.of(
+        seen.points,
+        (seen.rays - shift) / scale,
+        seen.tau,
+        seen.by_ray * scale,
+        seen.mounts,
+        seen.camera,
+    )
+    speeds = per_time[:, None] * (frame.slopes @ ways)
+    state = np.concatenate([rotation.ravel(), -rotation @ place, speeds.ravel()])
+    lines = linearized(through.packed, len(through), state, np.zeros((len(through), 6)))
+    by_pose, by_speed = lines.by_motion[:, :, :6], lines.by_motion[:, :, 6:]
+    size = 6 * len(frames)
+    columns = np.zeros((len(through), 2, size + _NUMBERS))
+    columns[:, :, 6 * k : 6 * k + 6] = by_pose
+    for turn, other, slopes in zip(turns, frame.others, frame.slopes.T, strict=True):
+        each = np.tensordot(by_speed.reshape(-1, 2, 2, 6), per_time * slopes, (2, 0))
+        columns[:, :, 6 * k : 6 * k + 6] -= each
+        columns[:, :, 6 * other : 6 * other + 6] += each @ np.kron(np.eye(2), turn)
+    columns[:, :, size] = by_speed @ (speeds * [[1.0], [2.0]]).ravel() / readout
+    by_length = np.einsum("nij,nj->nij", through.by_ray, lines.image)
+    columns[:, :, size + 1] = by_length.sum(axis=2) + seen.by_ray @ (length * middle)
+    columns[:, :, size + 2] = by_length @ _ASPECT
+    return lines.errors, columns
+
+
+def _evidence(fit: _Fit, parameters: int, least: float) -> float:
+    """Return the log evidence of a fit, with outliers of little weight (Schwarz).
+
+    ``least``: px^2, variance that noise and map have in any case.
+    """
+    squared = fit.squared_errors
+    weights = 1.0 / (1.0 + squared / (9.0 * _variance(squared)))
+    inside = weights > 0.0
+    total, count = float(weights[inside] @ squared[inside]), len(squared)
+    variance = max(total / max(2.0 * weights.sum() - parameters, 1.0), least)
+    return -count * (math.log(variance) + 1.0) - 0.5 * parameters * math.log(2 * count)
