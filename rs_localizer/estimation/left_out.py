@@ -46,6 +46,8 @@ _LEAST_CHANCE = -math.log(1e-3)
 # Odds for a motion to be the world's, of two motions, from which it is published. Second bodies of
 # 40 to 45 % of 100 points leave 4.8 to 60, halves of a map that were moved mostly 1 (paired set).
 _LEAST_ODDS = 4.0
+# More points than this only take time.
+_MANY = 250
 # Beyond so many gates a point is another's.
 _ELSEWHERE = 2.0
 # Gates before a declared map, of two motions, differ by less, and a widened one from both by more.
@@ -210,13 +212,12 @@ def _own_motion(
 ) -> _Group | None:
     """Return the motion that more left-out points share than chance makes, or None."""
     observations, gate = observed.observations, WIDEST_GATE * threshold
-    part = replace(
-        observed, observations=observations.only(np.flatnonzero(rest)), ranking=observed.ranking[:0]
-    )
     left, area = int(np.count_nonzero(rest)), _area(observed)
+    some = np.flatnonzero(rest)[:: 1 + left // _MANY]
+    part = replace(observed, observations=observations.only(some), ranking=observed.ranking[:0])
     start, circle = search.rough(part), GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length
     near = int(np.count_nonzero(part.observations.within(start.state, circle)))
-    if _surprise(left, near, _OF_POSE, math.pi * circle**2 / area) < _LEAST_CHANCE:
+    if _surprise(len(some), near, _OF_POSE, math.pi * circle**2 / area) < _LEAST_CHANCE:
         return None
     own = search.from_rough(part, start)
     group = rest & observations.within(own.state, gate)
