@@ -113,6 +113,11 @@ def test_right_maps_are_not_doubted_wherever_matches_lie(scene):
     assert np.mean(said[right] > 0.05) < 0.1
 
 
+def test_a_board_that_leaves_the_view_ends_nothing():
+    """Its last corners determine a motion so badly that a matrix has no inverse in numbers."""
+    assert sequence(2049, ("right",), "board")
+
+
 def test_a_right_scene_in_the_middle_of_the_image_is_not_doubted(monkeypatch):
     """A fifth of the matches is wrong: the scene of the examples, which users start with."""
     monkeypatch.syspath_prepend(str(EXAMPLES))

@@ -162,11 +162,11 @@ def calibration_effect(
         prior, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
         of_speed = terms_at(terms, speed, rotation is not None)
         add_prior(of_speed, posterior.state, variance, prior, slope)
-        inverse = inverted(information + prior)
-        if not math.isfinite(inverse[0, 0]):
+        inverse, alone = inverted(information + prior), inverted(of_motion + prior)
+        if not (math.isfinite(inverse[0, 0]) and math.isfinite(alone[0, 0])):
             return NO_EFFECT._replace(still_deviation=still)
         pull -= part * (inverse[:MOTION_PARAMETERS] @ crossed)
-        taken += part * (inverted(of_motion + prior) @ of_errors)
+        taken += part * (alone @ of_errors)
     # What no motion takes up.
     left = np.trace(every[fitted:, fitted:]) + np.sum(taken * (of_motion @ taken - 2.0 * of_errors))
     residual = math.sqrt(max(float(left), 0.0) / max(len(rows), 1))
