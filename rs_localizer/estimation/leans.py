@@ -133,6 +133,8 @@ def _bent(step: Array, frame: Frame) -> float:
 
 def over_leans(frame: Frame, mode: Mode, terms: PriorTerms) -> Mode:
     """Integrate the mode of a plane over its leans, if they are hardly known."""
+    if not np.isfinite(mode.covariance).all():  # so open that it cannot be computed
+        return mode
     held = frame._replace(
         shared=frame.shared.at(mode.size), noise=frame.noise._replace(deviation=mode.noise)
     )
