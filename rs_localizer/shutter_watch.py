@@ -31,7 +31,6 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.lens import centre_of
 from rs_localizer.core.rig import Rig
 from rs_localizer.core.scanning import ACROSS, REVERSED, ScanDirection
 from rs_localizer.core.shutter import Motion
@@ -135,7 +134,7 @@ class ShutterWatch:
         self._gate, self._camera = _GATE * threshold, camera
         if camera is not None:
             self._exposure = Rig.of(camera).exposure().ahead()
-            self._direction, self._centre = ScanDirection(camera.scan_direction), centre_of(camera)
+            self._direction = ScanDirection(camera.scan_direction)
             self._sideways = replace(camera, scan_direction=ACROSS[self._direction])
             spread = np.repeat([_ANY * camera.readout_time, _LIKE_MOTION], [2, 12])
             self._any = np.diag(spread**2)

@@ -1,15 +1,15 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Another camera matrix than K, from a few frames together.
+"""Another camera matrix than K, from three frames together.
 
 Within one frame before a plane, motion takes up what a wrong focal length leaves. Between frames
-the same camera moves: a parabola through the poses of three frames is how it moves within the
-middle one. So each frame has a pose only, and all of them share
+the same camera moves: a parabola through the poses of three frames is how it moves within each
+of them. So each frame has a pose only, and all of them share
 
     the readout time, the focal length, and fy over fx,
 
-as parts of what is given. A readout time that is off is no fault of K and is left free; with it
-six frames tell a focal length to some 0.2 %.
+as parts of what is given. A readout time that is off is no fault of K and is left free; beside it
+three frames tell a focal length to 1 %, and fy over fx to 0.1 %.
 """
 
 from __future__ import annotations
