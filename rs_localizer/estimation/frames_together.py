@@ -93,7 +93,7 @@ class _Linked(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """What a camera leaves."""
+    """Poses and numbers of a fit, and the errors that it leaves."""
 
     poses: list[tuple[Array, Array]]  # rotation (3,3) camera_from_map and centre (3,)
     numbers: Array  # (3,) beside those that are given
