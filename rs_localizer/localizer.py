@@ -53,6 +53,7 @@ from rs_localizer.estimation.prior import (
     Prior,
     PriorTerms,
     assumptions,
+    knows_motion,
     of_frame,
     state_in,
     unchecked,
@@ -419,8 +420,9 @@ class Localizer:
         Args:
             prior: which predicted the motion.
         """
-        tracked, terms = prior is not None, observed.terms
-        if prior is not None:
+        # A first guess that knows nothing is no prediction.
+        tracked, terms = prior is not None and knows_motion(prior), observed.terms
+        if prior is not None and tracked:
             terms = self._own_terms(observed, prior)
         effect = NO_EFFECT
         enough = np.count_nonzero(posterior.inliers) >= self.config.min_inliers
