@@ -173,9 +173,12 @@ class Broadcaster:
 
     def _hear(self, transforms: list[Any], static: bool) -> None:
         for item in transforms:
-            for notice, text in self._rivals.hear(item, self.decision, static=static).items():
-                self._refusals.notice(notice, text)
+            self._judge(item, static)
         self._flush()
+
+    def _judge(self, item: Any, static: bool) -> None:
+        for notice, text in self._rivals.hear(item, self.decision, static=static).items():
+            self._refusals.notice(notice, text)
 
     def _flush(self) -> None:
         with self._sending:
@@ -315,13 +318,18 @@ class Broadcaster:
             return
         other = self._rivals.parent(item)
         if other != item.parent:
-            raise TransformError(
-                f"TF frame {item.child!r} already has parent {other!r}; "
-                "choose publish_tf map_to_odom, or the root of the camera's frames as base_frame"
+            advice = (
+                "end the node that sends that"
+                if self._corrects
+                else "choose publish_tf map_to_odom, or the root of the camera's frames as "
+                "base_frame"
             )
+            raise TransformError(f"TF frame {item.child!r} already has parent {other!r}; {advice}")
         message = make_transform(
             make_message, item.stamp_ns, item.parent, item.child, item.parent_from_child
         )
-        self._rivals.send(message)
+        early = self._rivals.send(message)
         self._broadcaster.sendTransform(message)
+        if early is not None:
+            self._judge(early, True)
         self._sent = time.monotonic()

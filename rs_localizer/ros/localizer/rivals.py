@@ -34,6 +34,7 @@ class Rivals:
         self._own: set[Link] = set()
         self._parents: dict[str, tuple[str, str]] = {}  # by child: the last one, the one before
         self._static: dict[str, str] = {}  # parents of those that are, by child
+        self._early: dict[Link, Any] = {}  # static ones, which come once, before we send
         self.static: dict[str, str] = {}
         """What contradicts for ever, by notice."""
 
@@ -42,15 +43,17 @@ class Rivals:
         with self._lock:
             return self._parents.get(item.child, (item.parent, ""))[0]
 
-    def send(self, message: Any) -> None:
-        """Remember a TransformStamped that is sent."""
+    def send(self, message: Any) -> Any:
+        """Remember a TransformStamped that is sent; return a static one that was there before."""
         with self._lock:
-            self._own.add(_link(message))
-            self._sent[stamp_ns(message), _numbers(message)] = None
-            if self._first_ns is None:
-                self._first_ns = stamp_ns(message)
+            link, sent_ns = _link(message), stamp_ns(message)
+            self._own.add(link)
+            self._sent[sent_ns, _numbers(message)] = None
+            # Time may have gone back.
+            self._first_ns = sent_ns if self._first_ns is None else min(self._first_ns, sent_ns)
             while len(self._sent) > _REMEMBERED:
                 self._sent.popitem(last=False)
+            return self._early.pop(link, None)
 
     def hear(self, message: Any, decision: Decision | None, *, static: bool) -> dict[str, str]:
         """Return what is wrong with a TransformStamped that has come, by notice.
@@ -66,6 +69,8 @@ class Rivals:
                 text = self._rival(message, link, decision, static)
             else:
                 text = self._two_parents(*link, static)
+                if static:
+                    self._early[link] = message
         if not text:
             return {}
         found: dict[str, str] = {Notice.SECOND_BROADCASTER: text}
@@ -101,6 +106,9 @@ class Rivals:
         fixed = self._static.get(child, parent)
         if static:
             self._static[child] = parent
+        if ours := [own for own, of in self._own if of == child]:
+            self._parents[child] = parent, last
+            return f"TF frame {child!r} has two parents, {ours[0]!r} and {parent!r}"
         if parent == last:
             return ""
         self._parents[child] = parent, last

@@ -303,6 +303,36 @@ def test_a_static_one_is_seen_for_ever(sending, robot, peer):
     assert "map -> odom" in sending.broadcaster.fault()["second_broadcaster"]
 
 
+def test_a_static_one_that_was_there_before_the_first_pose_is_seen(made, robot, peer):
+    robot.send("map", "odom", 4.7, turn=NO_TURN)
+    node = made(publish_tf="map_to_odom", base_frame="base_link")
+    awaited(peer, lambda: node.tf.lookup("map", "odom", None))
+    odometry(node, robot, peer, *range(50, 61))
+    assert not node.broadcaster.fault()
+    node.publish(frame(5_500_000_000, x=5.5))
+    assert "(4.70, 0.00, 0.00) m" in node.broadcaster.fault()["second_broadcaster"]
+    assert len(rivals(node)) == 1
+
+
+def test_a_rival_is_seen_after_time_has_gone_back(sending, robot, peer):
+    sending.broadcaster.jumped(-5.0)
+    odometry(sending, robot, peer, *range(5, 16))
+    sending.publish(frame(10**9, x=1.0))
+    robot.send("map", "odom", 99.0, 1_300_000_000, NO_TURN)
+    assert peer.spin_until(lambda: rivals(sending))
+
+
+def test_another_parent_of_what_it_sends_is_a_rival(sending, robot, peer):
+    robot.send("world", "odom", 4.7, 6_300_000_000, NO_TURN)
+    assert peer.spin_until(lambda: rivals(sending))
+    assert rivals(sending)[0] == "TF frame 'odom' has two parents, 'map' and 'world'"
+    odometry(sending, robot, peer, *range(61, 66))
+    assert peer.spin_until(lambda: "not_broadcast" in dict(sending.notes))
+    said = dict(sending.notes)["not_broadcast"]
+    assert "TF frame 'odom' already has parent 'world'" in said
+    assert "choose" not in said  # what is chosen already
+
+
 def test_the_node_before_its_restart_and_a_recording_are_no_rivals(sending, robot, peer):
     robot.send("map", "odom", 4.7, 5_400_000_000, NO_TURN)  # sent before this one began
     robot.send("map", "odom", 0.005, 6_300_000_000, NO_TURN)  # recorded of the same drive
