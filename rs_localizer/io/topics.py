@@ -12,11 +12,12 @@ DETECTIONS = "detections"  # tags of apriltag_ros
 MAP_POINTS = "map_points"
 CAMERA_INFO = "camera_info"
 IMU = "imu"
+PRIOR_ODOMETRY = "prior_odometry"
 # A user's pose, as RViz and nav2 give it, and a filter's: of the node alone, and their types.
 GIVEN_POSES = {
     "initialpose": "geometry_msgs/msg/PoseWithCovarianceStamped",
     "~/set_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "prior_odometry": "nav_msgs/msg/Odometry",
+    PRIOR_ODOMETRY: "nav_msgs/msg/Odometry",
 }
 # Inputs of the detectors.
 IMAGE = "image"

@@ -30,6 +30,7 @@ from rs_localizer.io.topics import (
     KEYPOINTS,
     LIVE,
     POSE,
+    PRIOR_ODOMETRY,
 )
 from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.frames import FrameLocalizer
@@ -246,8 +247,8 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
                     overridable=name.rpartition("/")[2] in _OVERRIDABLE,
                     single=item.role is not Role.STATE,
                 )
-        if not config.of_cameras:
-            for name, type_name in GIVEN_POSES.items():
+        for name, type_name in GIVEN_POSES.items():
+            if not config.of_cameras or name != PRIOR_ODOMETRY:  # frames of a rig have no prior
                 found[name] = Topic(message_class(type_name), self._take_pose)
         return found
 
@@ -290,6 +291,8 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
             return
         if not given.lasts:
             self._broadcaster.give(given)
+        if self.config.of_cameras:
+            return
         kind = "filter's pose" if given.lasts else "given pose"
         self._update(kind, FrameLocalizer.give_pose, given)
 

@@ -5,14 +5,16 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.srv import GetState
 from rclpy.duration import Duration
 
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.transforms import Transform, make_transform
-from rs_localizer.ros.node.conversion import copy_message, message_class
+from rs_localizer.ros.node.conversion import copy_message, make_message, message_class
 from rs_localizer.tools.simulation.simulated_rig import RIG_FRAME, optical_frame
 
 from ...pipeline.opposed_pair import PARTS, record  # noqa: TID252 - Python has a package "test"
@@ -128,4 +130,24 @@ def test_node_and_replay_say_the_same_of_a_pair(recording, tmp_path, start_node,
         assert peer.spin_until(lambda: "Inliers of right" in robot.values)
         assert "Notice: no_images" in robot.odd
     assert "right is left out: no image in the last 3 frames" in node.log
+    assert node.stop() == 0
+
+
+def test_a_click_begins_the_transform_of_a_pair(recording, start_node, peer):
+    node = start_node(
+        "--params-file", str(recording / "parameters.yaml"), "-p", "publish_tf:=map_to_odom",
+        "-p", f"base_frame:={RIG_FRAME}", **ENVIRONMENT,
+    )  # fmt: skip
+    node.wait_for_log("active with solver")
+    with around.tf2_ros() as tf2_ros:
+        odometry = tf2_ros.StaticTransformBroadcaster(peer.node)
+        at = Transform(np.eye(3), np.zeros(3))
+        odometry.sendTransform(make_transform(make_message, 0, "odom", RIG_FRAME, at))
+        click = PoseWithCovarianceStamped()
+        click.header.frame_id, click.pose.pose.orientation.w = "map", 1.0
+        sender = peer.node.create_publisher(PoseWithCovarianceStamped, "/initialpose", 1)
+        assert peer.spin_until(sender.get_subscription_count, 20.0)
+        peer.spin_until(lambda: False, 1.0)  # /tf_static comes, too
+        sender.publish(click)
+        assert peer.spin_until(lambda: "pose_given: taken: map -> odom begins" in node.log)
     assert node.stop() == 0
