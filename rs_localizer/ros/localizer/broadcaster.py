@@ -164,7 +164,7 @@ class Broadcaster:
     def give(self, given: GivenPose) -> None:
         """Take a pose that a user gives, for ``map_to_odom``."""
         if self._corrects:
-            self._await(lambda last: self._click(given, last))
+            self._await(lambda last: self._asked(given, last))
 
     def _await(self, take: Callable[[bool], None]) -> None:
         with self._sending:
@@ -208,6 +208,15 @@ class Broadcaster:
         self._body = frame.body_frame
         self._hold()
 
+    def _asked(self, given: GivenPose, last: bool) -> None:
+        """Take a given pose, or say what hinders that."""
+        try:
+            self._click(given, last)
+        except NotYetError:
+            raise
+        except TransformError as error:
+            self._reply(f"refused: {error}")
+
     def _click(self, given: GivenPose, last: bool) -> None:
         """Take a given pose, and answer."""
         config, body, frame = self._config, given.body or self._body, given.frame
@@ -218,6 +227,9 @@ class Broadcaster:
             text = f"refused: it is in {frame!r}, the map is {known!r}"
         else:
             text = self._clicked(given, body, last)
+        self._reply(text)
+
+    def _reply(self, text: str) -> None:
         self._answer = f"{text} ({time.strftime('%H:%M:%S')})"
         self._refusals.notice(Notice.POSE_GIVEN, text)
 

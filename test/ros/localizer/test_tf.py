@@ -249,6 +249,15 @@ def test_a_click_without_a_body_is_refused(made):
     made(publish_tf="map_to_camera").broadcaster.give(click(0.0, 5.0))
 
 
+def test_a_click_without_odometry_is_answered(made):
+    node = made(publish_tf="map_to_odom", base_frame="base_link", transform_tolerance=0.0)
+    node.broadcaster.give(click(0.0, 5.0))
+    notice, text = node.notes[-1]
+    assert notice == "pose_given"
+    assert text.startswith("refused: ")
+    assert node.broadcaster.values["Last given pose"].startswith(text)
+
+
 def test_the_last_pose_is_kept_and_started_from(made, robot, peer, tmp_path):
     file = tmp_path / "pose.json"
     settings = {
