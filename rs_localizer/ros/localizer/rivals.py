@@ -89,13 +89,16 @@ class Rivals:
             return other if static else ""
         if not static and stamp_ns(message) <= (self._first_ns or 0):
             return ""  # of the node before its restart
-        held, now, spread = decision.state.held, decision.state.newest, decision.covariance
-        assert held and now and spread is not None  # noqa: PT018 - or nothing is sent
-        off = held.pose.offset(replace(held.pose, map_from_odom=theirs), now)
+        held, now = decision.state.held, decision.state.newest
+        assert held and now  # noqa: PT018 - or nothing is sent
+        # Where the last pose was: the less is known since then, the more a rival harms.
+        last, moved = held.newest, replace(held.pose, map_from_odom=theirs)
+        there, spread = held.pose.offset(moved, last.since), last.covariance
         within = (
-            np.linalg.norm(off[part]) <= _DEVIATIONS * np.sqrt(spread[part, part].trace())
+            np.linalg.norm(there[part]) <= _DEVIATIONS * np.sqrt(spread[part, part].trace())
             for part in (PLACE, TURN)
         )
+        off = held.pose.offset(moved, now)
         if not static and all(within):
             return ""
         return f"{other}: {_said(theirs)} instead of {_said(ours)}, which moves the body {far(off)}"

@@ -323,6 +323,14 @@ def test_a_static_one_that_was_there_before_the_first_pose_is_seen(made, robot, 
     assert len(rivals(node)) == 1
 
 
+def test_a_rival_is_seen_however_long_no_pose_has_come(sending, robot, peer):
+    odometry(sending, robot, peer, 1200)
+    assert peer.spin_until(lambda: sending.broadcaster.decision.seconds > 110.0)
+    assert np.sqrt(sending.broadcaster.decision.covariance[0, 0]) > 1.0
+    robot.send("map", "odom", 4.7, 120_100_000_000, NO_TURN)
+    assert peer.spin_until(lambda: rivals(sending), 20.0)
+
+
 def test_a_rival_is_seen_after_time_has_gone_back(sending, robot, peer):
     sending.broadcaster.jumped(-5.0)
     odometry(sending, robot, peer, *range(5, 16))
