@@ -4,7 +4,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -180,9 +180,13 @@ def diagnose(condition: Condition, summary: Summary) -> Health:
 
     The states are ``inactive``, ``waiting for`` something missing or frames, ``busy``, ``lost``,
     ``localized`` (by a search) and ``tracking``. An oddity is a warning if there is nothing worse
-    to report.
+    to report, and another broadcaster of the same transform is an error whatever else there is.
     """
-    return _judge(condition, summary).with_values(_values(condition, summary))
+    health = _judge(condition, summary)
+    rival = condition.oddities.get(Notice.SECOND_BROADCASTER, "")
+    if rival not in health.message and health.state is not State.INACTIVE:
+        health = replace(health, level=Level.ERROR, message=f"{health.message}; {rival}")
+    return health.with_values(_values(condition, summary))
 
 
 def _judge(condition: Condition, summary: Summary) -> Health:

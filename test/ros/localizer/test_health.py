@@ -176,6 +176,25 @@ def test_what_is_odd_though_there_are_poses(world, change, level, text):
     assert health.message.startswith(text)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"silence": {"correspondences": silent("/c", "no publisher")}},
+        {"silence": {"correspondences": silent("/c", "no publisher", heard=True)}},
+        {"missing": ("camera_info",), "silence": {"correspondences": silent("/c", "")}},
+    ],
+)
+def test_a_rival_is_an_error_while_the_camera_sees_nothing_too(world, change):
+    """A click has begun map -> odom, or it is held."""
+    rival = {"oddities": {"second_broadcaster": "it is 4.7 m off"}}
+    health, alone = world.diagnose(replace(GOOD, **change | rival)), replace(GOOD, **change)
+    assert health.level == Level.ERROR
+    assert health.state == world.diagnose(alone).state
+    assert health.message == f"{world.diagnose(alone).message}; it is 4.7 m off"
+    idle = world.diagnose(replace(GOOD, life_cycle="inactive", **rival))
+    assert idle.level == Level.OK
+
+
 def test_integrity_joins_its_pose():
     localized = SimpleNamespace(
         stamp_ns=5 * 10**9 + 7, map_frame="map", body_frame="base_link",
