@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Who else broadcasts a transform that the node sends, and frames that have two parents."""
 
+import math
 import threading
+import time
 from collections import OrderedDict
 from dataclasses import replace
 from typing import Any
@@ -21,6 +23,8 @@ _REMEMBERED = 1000
 # A transform that is this many deviations away is not ours: neither from before a restart, nor of a
 # recording.
 _DEVIATIONS = 5.0
+# Another parent of a frame that we send has ended if it has not come for so long (s).
+_LASTS = 10.0
 Link = tuple[str, str]  # parent and child
 
 
@@ -33,6 +37,7 @@ class Rivals:
         self._first_ns: int | None = None
         self._own: set[Link] = set()
         self._parents: dict[str, tuple[str, str]] = {}  # by child: the last one, the one before
+        self._until: dict[str, float] = {}  # time.monotonic() until which others have ours
         self._static: dict[str, str] = {}  # parents of those that are, by child
         self._early: dict[Link, Any] = {}  # static ones, which come once, before we send
         self.static: dict[str, str] = {}
@@ -41,6 +46,8 @@ class Rivals:
     def parent(self, item: Broadcast) -> str:
         """Return the parent that others give this child; its own if nobody does."""
         with self._lock:
+            if time.monotonic() > self._until.get(item.child, math.inf):
+                del self._parents[item.child], self._until[item.child]
             return self._parents.get(item.child, (item.parent, ""))[0]
 
     def send(self, message: Any) -> Any:
@@ -111,6 +118,8 @@ class Rivals:
             self._static[child] = parent
         if ours := [own for own, of in self._own if of == child]:
             self._parents[child] = parent, last
+            lasts = math.inf if child in self._static else _LASTS
+            self._until[child] = time.monotonic() + lasts
             return f"TF frame {child!r} has two parents, {ours[0]!r} and {parent!r}"
         if parent == last:
             return ""

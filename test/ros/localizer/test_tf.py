@@ -339,7 +339,7 @@ def test_a_rival_is_seen_after_time_has_gone_back(sending, robot, peer):
     assert peer.spin_until(lambda: rivals(sending))
 
 
-def test_another_parent_of_what_it_sends_is_a_rival(sending, robot, peer):
+def test_another_parent_of_what_it_sends_is_a_rival(sending, robot, peer, monkeypatch):
     robot.send("world", "odom", 4.7, 6_300_000_000, NO_TURN)
     assert peer.spin_until(lambda: rivals(sending))
     assert rivals(sending)[0] == "TF frame 'odom' has two parents, 'map' and 'world'"
@@ -348,6 +348,11 @@ def test_another_parent_of_what_it_sends_is_a_rival(sending, robot, peer):
     said = dict(sending.notes)["not_broadcast"]
     assert "TF frame 'odom' already has parent 'world'" in said
     assert "choose" not in said  # what is chosen already
+    # It goes on when the other has ended.
+    monkeypatch.setattr("rs_localizer.ros.localizer.rivals._LASTS", 0.0)
+    robot.send("world", "odom", 4.7, 6_800_000_000, NO_TURN)
+    odometry(sending, robot, peer, *range(67, 73))
+    assert peer.spin_until(lambda: sending.broadcaster._sent_ns > 7_200_000_000, 20.0)
 
 
 def test_the_node_before_its_restart_and_a_recording_are_no_rivals(sending, robot, peer):
