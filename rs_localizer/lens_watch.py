@@ -112,8 +112,16 @@ class LensWatch:
         calibration[ANGULAR, ANGULAR][axis, axis] += rate**2
         return replace(found, calibration_covariance=calibration)
 
-    def add(self, time_ns: int, found: Estimate | Failure, points: Array, pixels: Array) -> None:
-        """Take a frame of a camera alone, whose middle row was exposed then, as it was found."""
+    def add(
+        self, time_ns: int, found: Estimate | Failure, points: Array, pixels: Array,
+        *, jumped: bool = False,
+    ) -> None:  # fmt: skip
+        """Take a frame of a camera alone, whose middle row was exposed then, as it was found.
+
+        ``jumped``: no camera goes there from the last frame, nor does a parabola.
+        """
+        if jumped:
+            self._posed.clear()
         if not found:
             self._others.append(found.detail if found.reason is Reason.CALIBRATION else "")
             return

@@ -424,7 +424,7 @@ class Tracker:
         if pixels is not None:  # of a camera alone
             jumped = self._has_jumped(time_ns, prior, result)
             seen = np.asarray(points, float), np.asarray(pixels, float)
-            self.lens.add(time_ns, result, *seen)
+            self.lens.add(time_ns, result, *seen, jumped=jumped)
             if self.lens.matrix is None:
                 self.shutter.add(time_ns, result, *seen, jumped=jumped)
         if result:
