@@ -169,9 +169,12 @@ def pose_in_odometry(frame: Localized, config: NodeConfig, transforms: Transform
     """Return a frame's pose with the odometry at its time, for :func:`.decide`.
 
     Raises:
-        TransformError: when the frame says nothing of its time, or odometry says nothing for it.
+        TransformError: when the frame says nothing of its time, or odometry says nothing for it, or
+            the map is odometry's own frame.
     """
     _check_time(frame)
+    if frame.map_frame == config.odom_frame:
+        raise TransformError(f"the points are in {frame.map_frame!r}, which is odom_frame")
     odom_from_body = transforms.lookup(config.odom_frame, frame.body_frame, frame.stamp_ns)
     at = Odometry(frame.stamp_ns, odom_from_body)
     map_from_body = Transform(frame.pose.rotation, frame.pose.position)

@@ -6,6 +6,7 @@ import contextlib
 import json
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -240,6 +241,14 @@ def test_a_click_begins_it_and_is_carried_by_odometry(made, robot, peer):
     peer.spin_until(lambda: False, 0.25)
     odometry(node, robot, peer, 62)
     assert node.notes[2][1].startswith("taken: map -> odom begins with it; odometry does not know")
+
+
+def test_points_in_the_frame_of_odometry_are_no_map(made, robot, peer):
+    node = made(publish_tf="map_to_odom", base_frame="base_link")
+    odometry(node, robot, peer, *range(50, 61))
+    node.publish(replace(frame(5_500_000_000), map_frame="odom"))
+    assert [notice for notice, _ in node.notes] == ["not_broadcast"]
+    assert "the points are in 'odom', which is odom_frame" in node.notes[0][1]
 
 
 def test_a_click_without_a_body_is_refused(made):
