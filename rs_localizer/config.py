@@ -507,6 +507,8 @@ class NodeConfig(LocalizerConfig):
                 raise ValueError(f"{name} must not be empty")
         if self.base_frame == self.odom_frame:
             raise ValueError(f"base_frame and odom_frame are both {self.odom_frame!r}")
+        if self.saved_pose_file and self.tf_rate == 0.0:  # as its timer saves, and starts
+            raise ValueError("saved_pose_file needs a tf_rate above 0")
 
     def _check_cameras(self) -> None:
         if self.cameras == NO_NAMES:

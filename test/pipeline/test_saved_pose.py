@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rs_localizer.config import NodeConfig
 from rs_localizer.io.transforms import Transform
 from rs_localizer.pipeline.given_pose import load_pose, save_pose
 
@@ -44,3 +45,9 @@ def test_a_file_that_holds_no_pose_is_named(tmp_path, change, text):
     with pytest.raises(ValueError, match=text) as error:
         load_pose(file)
     assert str(file) in str(error.value)
+
+
+def test_a_file_that_no_timer_would_save_or_start_from_is_refused():
+    NodeConfig(saved_pose_file="pose.json")
+    with pytest.raises(ValueError, match="saved_pose_file needs a tf_rate above 0"):
+        NodeConfig(saved_pose_file="pose.json", tf_rate=0.0)
