@@ -125,6 +125,7 @@ def load_pose(file: Path) -> GivenPose | None:
     ):
         raise ValueError(f"saved_pose_file {file} holds no pose: numbers of shapes {shapes}")
     turned = np.abs(rotation @ rotation.T - np.eye(3)).max() < _ORTHONORMAL
+    turned &= np.linalg.det(rotation) > 0.0
     if not turned or np.linalg.eigvalsh(covariance).min() < -_ORTHONORMAL:
         raise ValueError(f"saved_pose_file {file} holds no rotation or no covariance")
     return GivenPose(0, frame, "", Transform(rotation, position), covariance + _MOVED)

@@ -32,6 +32,7 @@ def test_what_is_saved_is_started_from_and_less_certain(tmp_path):
         ({"position": [1.0, 2.0]}, "shapes"),
         ({"position": [1.0, 2.0, float("nan")]}, "shapes"),
         ({"rotation": np.ones((3, 3)).tolist()}, "no rotation"),
+        ({"rotation": np.diag([1.0, 1.0, -1.0]).tolist()}, "no rotation"),  # a mirror
         ({"covariance": (-np.eye(6)).tolist()}, "no covariance"),
         ({"position": "here"}, "holds no pose"),
         (None, "holds no pose"),
