@@ -114,3 +114,10 @@ def test_a_recording_that_is_cut_shows_no_other_matrix():
             pixels += random.normal(0.0, 0.3, pixels.shape)
             tracker.localize(10**12 + 33_333_333 * k, board, pixels)
             assert tracker.lens.fault == ""
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_board_that_no_hypothesis_explains_is_refused(seed):
+    """It raised LinAlgError: where nothing is found there are no leans to integrate over."""
+    (kind,) = [kind for kind in kinds() if kind.name == "f of 1.9 times, board"]
+    assert judged(kind, seed).published < 30

@@ -289,7 +289,7 @@ def _modes(
     linear = linear_at(frame, near)
     for one in hypotheses:
         mode, near, linear = mode_of(frame, near, linear, one.terms)
-        if planar:
+        if planar and mode.evidence > -math.inf:
             mode = over_leans(frame, mode, one.terms)
         evidence = mode.evidence + one.odds
         if evidence > -math.inf:
