@@ -98,19 +98,21 @@ def moving_board(board: np.ndarray, moved: np.ndarray, seconds: float) -> np.nda
     return pixels
 
 
-def test_a_recording_that_is_cut_shows_no_other_matrix():
-    """Stamps run on while the camera is elsewhere: no motion goes through such frames."""
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_recording_with_gaps_shows_no_other_matrix(lost):
+    """Stamps run on while the camera is elsewhere, or an image is lost: no parabola fits."""
     random = np.random.default_rng(1)
     camera = rsl.Camera(1280, 720, [[900, 0, 639.5], [0, 900, 359.5], [0, 0, 1]], readout_time=0.02)
     across, along = np.meshgrid(0.05 * np.arange(-3.5, 4.0), 0.05 * np.arange(-2.5, 3.0))
     board = np.column_stack([across.ravel(), along.ravel(), np.zeros(across.size)])
-    usual = np.repeat([0.12, 0.2, 0.2, 0.3], 3)
-    for _ in range(6):
+    usual, gaps = np.repeat([0.12, 0.2, 0.2, 0.3], 3), (2, 5)
+    for _ in range(8):
         tracker = Tracker(rsl.Localizer(camera))
-        for k in range(12):
-            if k in (0, 2, 5, 11):
+        for k in range(6):
+            if k == 0 or (k in gaps and not lost):
                 moved = random.normal(0.0, usual) + np.eye(12)[2] * 0.6
-            pixels = moving_board(board, moved, k / 30)
+            image = k + (sum(k >= gap for gap in gaps) if lost else 0)
+            pixels = moving_board(board, moved, image / 30)
             pixels += random.normal(0.0, 0.3, pixels.shape)
             tracker.localize(10**12 + 33_333_333 * k, board, pixels)
             assert tracker.lens.fault == ""

@@ -6,7 +6,7 @@ Within one frame before a plane, motion takes up what a wrong focal length leave
 the same camera moves: a parabola through the poses of three frames is how it moves within each
 of them. So each frame has a pose only, and all of them share
 
-    the readout time, the focal length, and fy over fx,
+    the readout time, the stamp of the middle one, the focal length, and fy over fx,
 
 as parts of what is given. A readout time that is off is no fault of K and is left free; beside it
 three frames tell a focal length to 1 %, and fy over fx to 0.1 %.
@@ -39,8 +39,11 @@ _LEAST_NOISE = 0.1  # px, no real error is smaller
 _LENGTHS = (0.6, 1.7)
 # The largest step of a number: beyond it the linear terms no longer hold.
 _MOST_STEP = 0.3
-# Deviations of readout time, focal length (logarithm) and fy over fx (logarithm) of any camera.
-_OTHER = np.array([3.0, 1.0, 0.1])
+# Deviations of readout time, stamp (of an interval: drivers stamp when an image arrives, or count
+# images of which some were lost), focal length and fy over fx (logarithms) of any camera.
+_OTHER = np.array([3.0, 0.2, 1.0, 0.1])
+# Numbers that are no fault of K, and all.
+_GIVEN, _NUMBERS = 2, 4
 # Deviation of the focal length of this very camera: also of one that is bent or lies before a map
 # that is (:mod:`.left_out`).
 _USUAL = 0.01
@@ -50,7 +53,7 @@ _EXACT = 1e-4
 # believed: right ones gain 0.0, boards of paper at most 0.27 (12 videos), wrong ones 2 to 9.
 _EACH = 1.0
 # fy over fx changes as each changes by a half, the other way.
-_NUMBERS, _ASPECT = 3, np.array([-0.5, 0.5])
+_ASPECT = np.array([-0.5, 0.5])
 
 
 class Fitted(NamedTuple):
@@ -89,14 +92,23 @@ class _Linked(NamedTuple):
 
     seen: Observations
     others: tuple[int, int]
-    slopes: Array  # (2,2) velocity and acceleration by the ways to the others, per readout
+    away: Array  # (2,) times to the others, readouts
+    shifted: Array  # (2,) their derivatives by the stamp of the middle frame
+
+
+def _slopes(away: Array) -> Array:
+    """Return velocity and acceleration (2,2) by the ways to two others, per readout."""
+    first, second = away
+    columns = np.array([[0.5 * second**2, -0.5 * first**2], [-second, first]])
+    slopes: Array = columns / (0.5 * first * second * (second - first))
+    return slopes
 
 
 class _Fit(NamedTuple):
     """Poses and numbers of a fit, and the errors that it leaves."""
 
     poses: list[tuple[Array, Array]]  # rotation (3,3) camera_from_map and centre (3,)
-    numbers: Array  # (3,) beside those that are given
+    numbers: Array  # (4,) beside those that are given
     squared_errors: Array  # (n,) px^2
 
 
@@ -120,8 +132,8 @@ def another_matrix(
     of_map = map_deviation * exposure.cameras[0].focal_length / float(depth)
     least = _LEAST_NOISE**2 + of_map**2
     most = math.exp(_EACH) * max(_variance(own**2), least)
-    size = 6 * len(frames) + 1
-    given = _fitted(frames, _Fit(poses, np.zeros(_NUMBERS), np.zeros(0)), 1)
+    size = 6 * len(frames) + _GIVEN
+    given = _fitted(frames, _Fit(poses, np.zeros(_NUMBERS), np.zeros(0)), _GIVEN)
     fits = [_fitted(frames, given, _NUMBERS)]
     if _variance(given.squared_errors) > most:  # or each frame hides what is wrong
         camera = exposure.cameras[0]
@@ -131,8 +143,9 @@ def another_matrix(
     other = max(fits, key=lambda fit: _evidence(fit, size + 2, least))
     if not _variance(other.squared_errors) < most:  # it leaves more than frames do
         return None
-    off, usual = other.numbers[1:], np.array([_USUAL, max(aspect_ratio, _EXACT)])
-    told = 0.5 * ((off / usual) ** 2 - (off / _OTHER[1:]) ** 2) > np.log(_OTHER[1:] / usual)
+    off, usual = other.numbers[_GIVEN:], np.array([_USUAL, max(aspect_ratio, _EXACT)])
+    any_camera = _OTHER[_GIVEN:]
+    told = 0.5 * ((off / usual) ** 2 - (off / any_camera) ** 2) > np.log(any_camera / usual)
     gain = _evidence(other, size + 2, least) - _evidence(given, size, least)
     if not (told.any() and gain > _EACH * len(other.squared_errors)):  # NaN is not
         return None
@@ -146,7 +159,7 @@ def _scaled(poses: Sequence[tuple[Array, Array]], length: float) -> _Fit:
         (rotation, rotation.T @ ((rotation @ place) * [1.0, 1.0, length]))
         for rotation, place in poses
     ]
-    return _Fit(away, np.array([0.0, math.log(length), 0.0]), np.zeros(0))
+    return _Fit(away, np.array([0.0, 0.0, math.log(length), 0.0]), np.zeros(0))
 
 
 def _frames(exposure: Exposure, posed: Sequence[Fitted], centre: Array) -> list[_Linked]:
@@ -160,9 +173,10 @@ def _frames(exposure: Exposure, posed: Sequence[Fitted], centre: Array) -> list[
         near = usable._replace(centre=centre)
         middle = min(max(k, 1), len(posed) - 2)
         others = sorted({middle - 1, middle, middle + 1} - {k})
-        away = times[others] - times[k]
-        slopes = np.linalg.inv(np.column_stack([away, 0.5 * away**2]))
-        frames.append(_Linked(packed(exposure, points, near), (others[0], others[1]), slopes))
+        interval = 0.5 * (times[middle + 1] - times[middle - 1])
+        shifted = interval * np.array([(each == middle) - float(k == middle) for each in others])
+        seen = packed(exposure, points, near)
+        frames.append(_Linked(seen, (others[0], others[1]), times[others] - times[k], shifted))
     return frames
 
 
@@ -229,9 +243,9 @@ def _linearized(frames: Sequence[_Linked], fit: _Fit, k: int, middle: Array) -> 
         np.r_[so3.log(np.ascontiguousarray(turn)), rotation @ (fit.poses[other][1] - place)]
         for turn, other in zip(turns, frame.others, strict=True)
     ])  # fmt: skip
-    readout = 1.0 + fit.numbers[0]
-    scale = np.exp(fit.numbers[1] + fit.numbers[2] * _ASPECT)
-    length = math.exp(fit.numbers[1])
+    more, late, longer, aspect = fit.numbers
+    readout, away = 1.0 + more, frame.away + late * frame.shifted
+    scale, length = np.exp(longer + aspect * _ASPECT), math.exp(longer)
     shift = (length - 1.0) * middle
     seen, per_time = frame.seen, readout ** np.array([1.0, 2.0])
     through = Observations.of(
@@ -242,21 +256,25 @@ def _linearized(frames: Sequence[_Linked], fit: _Fit, k: int, middle: Array) -> 
         seen.mounts,
         seen.camera,
     )
-    speeds = per_time[:, None] * (frame.slopes @ ways)
+    by_way = _slopes(away)
+    speeds = per_time[:, None] * (by_way @ ways)
+    shifts = frame.shifted[:, None] * np.column_stack([np.ones(2), away])
+    by_stamp = -per_time[:, None] * (by_way @ shifts @ by_way @ ways)
     state = np.concatenate([rotation.ravel(), -rotation @ place, speeds.ravel()])
     lines = linearized(through.packed, len(through), state, np.zeros((len(through), 6)))
     by_pose, by_speed = lines.by_motion[:, :, :6], lines.by_motion[:, :, 6:]
     size = 6 * len(frames)
     columns = np.zeros((len(through), 2, size + _NUMBERS))
     columns[:, :, 6 * k : 6 * k + 6] = by_pose
-    for turn, other, slopes in zip(turns, frame.others, frame.slopes.T, strict=True):
+    for turn, other, slopes in zip(turns, frame.others, by_way.T, strict=True):
         each = np.tensordot(by_speed.reshape(-1, 2, 2, 6), per_time * slopes, (2, 0))
         columns[:, :, 6 * k : 6 * k + 6] -= each
         columns[:, :, 6 * other : 6 * other + 6] += each @ np.kron(np.eye(2), turn)
     columns[:, :, size] = by_speed @ (speeds * [[1.0], [2.0]]).ravel() / readout
     by_length = np.einsum("nij,nj->nij", through.by_ray, lines.image)
-    columns[:, :, size + 1] = by_length.sum(axis=2) + seen.by_ray @ (length * middle)
-    columns[:, :, size + 2] = by_length @ _ASPECT
+    columns[:, :, size + 1] = by_speed @ by_stamp.ravel()
+    columns[:, :, size + 2] = by_length.sum(axis=2) + seen.by_ray @ (length * middle)
+    columns[:, :, size + 3] = by_length @ _ASPECT
     return lines.errors, columns
 
 
