@@ -8,8 +8,8 @@ of them. So each frame has a pose only, and all of them share
 
     the readout time, the stamp of the middle one, the focal length, and fy over fx,
 
-as parts of what is given. A readout time that is off is no fault of K and is left free; beside it
-three frames tell a focal length to 1 %, and fy over fx to 0.1 %.
+as parts of what is given. A readout time or a stamp that is off is no fault of K and is left free;
+beside them three frames tell a focal length to 1 %, and fy over fx to 0.1 %.
 """
 
 from __future__ import annotations
@@ -134,8 +134,12 @@ def another_matrix(
     most = math.exp(_EACH) * max(_variance(own**2), least)
     size = 6 * len(frames) + _GIVEN
     given = _fitted(frames, _Fit(poses, np.zeros(_NUMBERS), np.zeros(0)), _GIVEN)
-    fits = [_fitted(frames, given, _NUMBERS)]
-    if _variance(given.squared_errors) > most:  # or each frame hides what is wrong
+    hidden = _variance(given.squared_errors) > most  # or each frame hides what is wrong
+    near = _fitted(frames, given, _NUMBERS, rounds=1)
+    if not hidden and not _told(near, aspect_ratio).any():  # the first step would tell
+        return None
+    fits = [_fitted(frames, near, _NUMBERS)]
+    if hidden:
         camera = exposure.cameras[0]
         middles = np.zeros(2), centre_of(camera) / camera.focal_length
         starts = [given, *(_scaled(poses, length) for length in _LENGTHS)]
@@ -143,14 +147,21 @@ def another_matrix(
     other = max(fits, key=lambda fit: _evidence(fit, size + 2, least))
     if not _variance(other.squared_errors) < most:  # it leaves more than frames do
         return None
-    off, usual = other.numbers[_GIVEN:], np.array([_USUAL, max(aspect_ratio, _EXACT)])
-    any_camera = _OTHER[_GIVEN:]
-    told = 0.5 * ((off / usual) ** 2 - (off / any_camera) ** 2) > np.log(any_camera / usual)
+    told = _told(other, aspect_ratio)
     gain = _evidence(other, size + 2, least) - _evidence(given, size, least)
     if not (told.any() and gain > _EACH * len(other.squared_errors)):  # NaN is not
         return None
-    length, aspect = np.where(told, np.exp(off), 1.0).tolist()
+    length, aspect = np.where(told, np.exp(other.numbers[_GIVEN:]), 1.0).tolist()
     return Matrix(length, aspect)
+
+
+def _told(fit: _Fit, aspect_ratio: float) -> Array:
+    """Return whether focal length and fy over fx (2,) are those of any camera rather than K's."""
+    off, usual = fit.numbers[_GIVEN:], np.array([_USUAL, max(aspect_ratio, _EXACT)])
+    any_camera = _OTHER[_GIVEN:]
+    odds = 0.5 * ((off / usual) ** 2 - (off / any_camera) ** 2)
+    told: Array = odds > np.log(any_camera / usual)
+    return told
 
 
 def _scaled(poses: Sequence[tuple[Array, Array]], length: float) -> _Fit:
@@ -180,7 +191,13 @@ def _frames(exposure: Exposure, posed: Sequence[Fitted], centre: Array) -> list[
     return frames
 
 
-def _fitted(frames: Sequence[_Linked], start: _Fit, free: int, middle: Array | None = None) -> _Fit:
+def _fitted(
+    frames: Sequence[_Linked],
+    start: _Fit,
+    free: int,
+    middle: Array | None = None,
+    rounds: int = _ROUNDS,
+) -> _Fit:
     """Return the fit of poses and of the first so many numbers.
 
     ``middle`` (2,): the principal point, in focal lengths, which moves with the focal length if the
@@ -188,9 +205,10 @@ def _fitted(frames: Sequence[_Linked], start: _Fit, free: int, middle: Array | N
     """
     middle = np.zeros(2) if middle is None else middle
     fit, size = start, 6 * len(frames)
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         lines = [_linearized(frames, fit, k, middle) for k in range(len(frames))]
-        variance = _variance(_squared(lines))
+        squared = _squared(lines)
+        variance = _variance(squared)
         known = np.r_[np.zeros(size), variance / _OTHER[:free] ** 2]
         information = np.diag(known)
         slope = known * np.r_[np.zeros(size), fit.numbers[:free]]
@@ -214,12 +232,10 @@ def _fitted(frames: Sequence[_Linked], start: _Fit, free: int, middle: Array | N
                 fit.poses, step[:size].reshape(-1, 2, 3), strict=True
             )
         ]
-        fit = _Fit(poses, numbers, fit.squared_errors)
-        if (
-            max(np.abs(step[size:]).max(), np.abs(step[:size].reshape(-1, 6)[:, :3]).max())
-            < _LEAST_STEP
-        ):
-            break
+        fit = _Fit(poses, numbers, squared)
+        turns = step[:size].reshape(-1, 6)[:, :3]
+        if max(np.abs(step[size:]).max(), np.abs(turns).max()) < _LEAST_STEP:
+            return fit  # whose errors are those before the step: they differ by nothing that counts
     lines = [_linearized(frames, fit, k, middle) for k in range(len(frames))]
     return fit._replace(squared_errors=_squared(lines))
 
@@ -262,17 +278,22 @@ def _linearized(frames: Sequence[_Linked], fit: _Fit, k: int, middle: Array) -> 
     by_stamp = -per_time[:, None] * (by_way @ shifts @ by_way @ ways)
     state = np.concatenate([rotation.ravel(), -rotation @ place, speeds.ravel()])
     lines = linearized(through.packed, len(through), state, np.zeros((len(through), 6)))
-    by_pose, by_speed = lines.by_motion[:, :, :6], lines.by_motion[:, :, 6:]
-    size = 6 * len(frames)
-    columns = np.zeros((len(through), 2, size + _NUMBERS))
-    columns[:, :, 6 * k : 6 * k + 6] = by_pose
+    size, own = 6 * len(frames), slice(6 * k, 6 * k + 6)
+    by_number = np.zeros(
+        (lines.by_motion.shape[2], size + _NUMBERS)
+    )  # of the motion within the frame
+    by_number[:6, own] = np.eye(6)
     for turn, other, slopes in zip(turns, frame.others, by_way.T, strict=True):
-        each = np.tensordot(by_speed.reshape(-1, 2, 2, 6), per_time * slopes, (2, 0))
-        columns[:, :, 6 * k : 6 * k + 6] -= each
-        columns[:, :, 6 * other : 6 * other + 6] += each @ np.kron(np.eye(2), turn)
-    columns[:, :, size] = by_speed @ (speeds * [[1.0], [2.0]]).ravel() / readout
-    by_length = np.einsum("nij,nj->nij", through.by_ray, lines.image)
-    columns[:, :, size + 1] = by_speed @ by_stamp.ravel()
+        for part, weight in enumerate(per_time * slopes, start=1):
+            rows = slice(6 * part, 6 * part + 6)
+            by_number[rows, own] -= weight * np.eye(6)
+            for half in (0, 3):
+                across = slice(6 * other + half, 6 * other + half + 3)
+                by_number[rows, across][half : half + 3] = weight * turn
+    by_number[6:, size] = (speeds * [[1.0], [2.0]]).ravel() / readout
+    by_number[6:, size + 1] = by_stamp.ravel()
+    columns = lines.by_motion @ by_number
+    by_length = through.by_ray * lines.image[:, None, :]
     columns[:, :, size + 2] = by_length.sum(axis=2) + seen.by_ray @ (length * middle)
     columns[:, :, size + 3] = by_length @ _ASPECT
     return lines.errors, columns
