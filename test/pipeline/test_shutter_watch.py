@@ -385,3 +385,24 @@ def test_a_real_camera_told_the_other_axis_is_refused():
     # It moves slowly. Before, 13 of 121 images were refused, and not for this.
     assert not any(results[40:])
     assert "moves top_to_bottom in 1" in frames.shutter.fault
+
+
+class Swayed(Shaken):
+    """A car that goes on for long enough for ten images per second."""
+
+    steady = ConstantVelocity(np.array([0.0, 0.0, 0.3]), np.array([0.0, 0.0, 0.02]), 8.0)
+    intervals_ns = steady.intervals_ns
+
+
+def test_a_hand_before_slow_images_is_not_contradicted():
+    """The way between images 0.1 s apart is 8 % shorter than its motion: so much longer is T."""
+    motion, seen = Swayed(10.0, 1.5), FrameSettings(100, 0.3, 0.1)
+    world = room(motion.state(0, np.linspace(0, 8, 9)).positions, np.random.default_rng(0), 5000)
+    tracker, said = Tracker(Localizer(CAMERA)), set()
+    for frame in list(simulate_frames(CAMERA, motion, world, seen))[::3]:
+        tracker.localize(frame.stamp_ns + 10**18, frame.points, frame.pixels)
+        said.add(tracker.shutter.kind)
+    measured = tracker.shutter.measured
+    assert said == {""}
+    assert measured is not None
+    assert measured.deviation < 0.04 * READOUT
