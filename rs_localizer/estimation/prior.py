@@ -385,11 +385,8 @@ def add_prior(
         else:  # without the logarithm of a rotation
             offset, by_turn = np.zeros(PARAMETERS), np.zeros((6, 3))
             offset[6:] = state[12:] - reference[12:]
-        pulled, first = np.zeros(PARAMETERS), 0 if posed else 6
-        for i in range(first, PARAMETERS):
-            for j in range(first, PARAMETERS):
-                pulled[i] += known[i, j] * offset[j]
-            cost += weight * offset[i] * pulled[i]
+        pulled, first = known @ offset, 0 if posed else 6
+        cost += weight * np.sum(offset * pulled)
         if posed:  # J^T P J and J^T p: J is the identity but for the columns of the turn
             known = known.copy()
             known[:, :3] = known[:, :6].copy() @ by_turn

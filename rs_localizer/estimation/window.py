@@ -339,7 +339,8 @@ def _solve(
             filtered[k + 1] = apply_step(states[k], step)
             moved = step_between(predicted[k], filtered[k + 1])
             surprise = np.sum(moved * (known @ moved))
-            surprise += np.sum(step * (told @ step - 2.0 * gradients[k]))
+            twice = 2.0 * gradients[k]
+            surprise += np.sum(step * (told @ step - twice))
         smoothed[count], spreads[count] = filtered[count], covariances[count]
         scores, weight = np.zeros((4, 3)), 1.0
         for k in range(count - 1, -1, -1):
