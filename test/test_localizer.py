@@ -82,6 +82,22 @@ def angle(rotation, other):
     return np.degrees(Rotation.from_matrix(rotation @ other.T).magnitude())
 
 
+def test_a_first_guess_of_infinite_variances_is_no_prediction():
+    """Before a lens that is off, a guess left an error twice in the covariance of real boards."""
+    points, pixels, _ = frame(camera(D=np.add(D, [0.02, 0.0, 0.0, 0.0, 0.0])), Path(3), noise=0.1)
+    localizer = rsl.Localizer(camera())
+    alone = localizer.localize(points, pixels)
+    guess = rsl.Motion(
+        alone.rotation, alone.translation, alone.angular_velocity, alone.linear_velocity
+    )
+    guessed = localizer.localize(
+        points, pixels, prior=rsl.Prior(guess, np.diag(np.full(12, np.inf)))
+    )
+    assert alone.model_error > 0.2
+    deviations = [np.sqrt(np.diag(found.covariance)) for found in (alone, guessed)]
+    np.testing.assert_allclose(deviations[1], deviations[0], rtol=0.05)
+
+
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_pose_and_velocities_without_noise_have_the_right_size_sign_and_frame(direction):
     cam, path = camera(scan_direction=direction), Path(1)
