@@ -35,7 +35,7 @@ _OF_DISTORTION = 0.6
 # So many of so many frames that another camera matrix explains are no chance: of twelve real boards
 # none has one.
 _OTHERS, _OF_THE_LAST = 3, 30
-# Frames are compared again after as many as before, and after so many at most: it takes 3 ms. Of
+# Frames are compared again after as many as before, and after so many at most: it takes 4 ms. Of
 # the last comparisons two must agree in another matrix to this part: three frames of a stabilized
 # film turn alike, too. Until then a focal length, as long as no comparison denies it, is believed.
 _RARELY, _COMPARISONS, _ALIKE = 192, 3, 0.2

@@ -283,13 +283,15 @@ def _linearized(frames: Sequence[_Linked], fit: _Fit, k: int, middle: Array) -> 
         (lines.by_motion.shape[2], size + _NUMBERS)
     )  # of the motion within the frame
     by_number[:6, own] = np.eye(6)
-    for turn, other, slopes in zip(turns, frame.others, by_way.T, strict=True):
+    for turn, other, way, slopes in zip(turns, frame.others, ways, by_way.T, strict=True):
+        about = np.linalg.inv(so3.right_jacobian(-way[:3]))
+        by_own, by_other = -np.eye(6), np.zeros((6, 6))
+        by_own[:3, :3], by_own[3:, :3] = -about, so3.hat(way[3:])
+        by_other[:3, :3], by_other[3:, 3:] = about @ turn, turn
         for part, weight in enumerate(per_time * slopes, start=1):
             rows = slice(6 * part, 6 * part + 6)
-            by_number[rows, own] -= weight * np.eye(6)
-            for half in (0, 3):
-                across = slice(6 * other + half, 6 * other + half + 3)
-                by_number[rows, across][half : half + 3] = weight * turn
+            by_number[rows, own] += weight * by_own
+            by_number[rows, 6 * other : 6 * other + 6] = weight * by_other
     by_number[6:, size] = (speeds * [[1.0], [2.0]]).ravel() / readout
     by_number[6:, size + 1] = by_stamp.ravel()
     columns = lines.by_motion @ by_number

@@ -26,7 +26,7 @@ MARGIN = 4
 """Samples before and after an interval that the spline through its samples wants to have: what
 lies farther away counts less than 0.5 % in it."""
 MEMORY_NS = 3_000_000_000
-"""For how long samples are remembered, before the newest."""
+"""Samples that are older than the newest one by more than this are forgotten."""
 MOST = 16_384
 """How many samples are remembered."""
 # Samples that come so much behind the newest are no stragglers: the clock was set back.
