@@ -29,6 +29,7 @@ from rs_localizer.estimation.acceptance import (
     sample_estimate,
     speeding,
     uncertain,
+    unfit,
 )
 from rs_localizer.estimation.calibration import (
     NO_EFFECT,
@@ -47,7 +48,6 @@ from rs_localizer.estimation.points import (
     checked_of_rig,
     find_usable,
     packed,
-    unfit,
 )
 from rs_localizer.estimation.prior import (
     Prior,
@@ -137,7 +137,7 @@ class Localizer:
         ordinary, values = LocalizerConfig(), self.config
         own = [
             f", {field.name}={getattr(values, field.name)!r}"
-            for field in fields(values)
+            for field in fields(ordinary)
             if getattr(values, field.name) != getattr(ordinary, field.name)
         ]
         seen = ", ".join(

@@ -17,6 +17,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
+from rs_localizer.config import NodeConfig
 from rs_localizer.solvers.table import SOLVERS
 
 K = np.array([[600.0, 0.0, 319.5], [0.0, 590.0, 239.5], [0.0, 0.0, 1.0]])
@@ -307,6 +308,8 @@ def test_what_users_mistake_is_named():
     localizer = rsl.Localizer(camera(), inlier_threshold=3.0)
     assert "640x480, " in repr(localizer)
     assert "inlier_threshold=3.0" in repr(localizer)
+    of_a_node = rsl.Localizer(camera(), NodeConfig(inlier_threshold=3.0, readout_time=0.01))
+    assert repr(of_a_node) == repr(localizer)
     result = localizer.localize(points, pixels)
     for tau in (240.0, -0.6, np.nan):
         with pytest.raises(ValueError, match=r"tau must lie between -0\.5, the first row"):

@@ -12,11 +12,13 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
-from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shake import FUNCTIONS, shake_at, shake_basis, within_rows
 from rs_localizer.core.shutter import Motion, carried, numbers_of
 from rs_localizer.core.state import ANGULAR, MOTION_PARAMETERS, PARAMETERS, TURN
 from rs_localizer.native import entry
+
+if TYPE_CHECKING:  # kernels of other modules are compiled from this one, and not from words
+    from rs_localizer.core.reasons import Reason
 
 # Readouts within which accelerations fade by exp(-1): here they do not fade.
 _NO_FADING = 1e9

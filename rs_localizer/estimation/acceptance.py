@@ -10,6 +10,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.reasons import Reason
+from rs_localizer.core.rig import Exposure
 from rs_localizer.core.state import (
     ANGULAR,
     LINEAR,
@@ -30,7 +31,7 @@ from rs_localizer.estimation.calibration import CalibrationEffect, promised
 from rs_localizer.estimation.gaussian import along_arcs
 from rs_localizer.estimation.hypotheses import Posterior
 from rs_localizer.estimation.known_rotation import with_turn
-from rs_localizer.estimation.points import Observed
+from rs_localizer.estimation.points import Observed, Usable
 
 # Errors as large as the gate lets them be are those of points strewn over it.
 # A global shutter leaves errors of the motion beside the noise. In inlier thresholds.
@@ -49,6 +50,34 @@ _MOST_MODEL_ERROR = 1.5
 # of this limit so many squared deviations of the velocities leave a part of 1 / e. Cameras that are
 # fast leave none (a phone at 3.4 deviations: 0.04 px).
 _SPEEDS_AND_ERRORS, _LEAST_OF_THE_LIMIT = 8.0, 0.25
+# Points that lie closer together than this (px) show no perspective.
+_LEAST_EXTENT = 5.0
+
+
+def unfit(exposure: Exposure, pixels: Array, usable: Usable, needed: int) -> Failure | None:
+    """Return why points cannot carry a pose whatever the motion, or None.
+
+    Args:
+        pixels: (n,2) of all points.
+        usable: which of them can be used.
+        needed: fewest points of a pose.
+    """
+    indices = usable.indices
+    if len(indices) < needed:
+        outside = int(np.count_nonzero(~usable.shown))
+        sizes = " or ".join(sorted({f"{w} x {h}" for w, h in (c.size for c in exposure.cameras)}))
+        hint = f"; {outside} lie outside the image of {sizes} pixels" if outside else ""
+        return Failure(
+            Reason.TOO_FEW_POINTS,
+            f"{len(indices)} usable points of {len(pixels)}, {needed} are needed{hint}",
+        )
+    if usable.extent < _LEAST_EXTENT:
+        return Failure(
+            Reason.DEGENERATE,
+            f"all {len(indices)} points lie within {usable.extent:.2g} pixels; are these "
+            "normalized coordinates? Pixels of the raw image are needed",
+        )
+    return None
 
 
 def refusal(

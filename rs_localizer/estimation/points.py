@@ -25,11 +25,9 @@ from rs_localizer.core.arrays import (
     Random,
 )
 from rs_localizer.core.blocks import median
-from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Mounts, Rig
 from rs_localizer.core.rotation_prior import RotationPrior, compensated
 from rs_localizer.core.simd.tracing import LANES
-from rs_localizer.core.types import Failure
 from rs_localizer.estimation.prior import Assumed, PriorTerms
 from rs_localizer.estimation.projection import (
     AXES,
@@ -62,8 +60,6 @@ def median_depth(data: Array2, state: Array1, chosen: BoolArray1) -> float:
 
 # Pixels may lie outside the image by this part of it: noise, and features at its border.
 _MARGIN = 0.05
-# Points that lie closer together than this (px) show no perspective.
-_LEAST_EXTENT = 5.0
 
 
 def checked(
@@ -133,32 +129,6 @@ def checked_of_rig(
         np.concatenate(pixels),
         np.concatenate(scored) if scored else None,
     )
-
-
-def unfit(exposure: Exposure, pixels: Array, usable: Usable, needed: int) -> Failure | None:
-    """Return why points cannot carry a pose whatever the motion, or None.
-
-    Args:
-        pixels: (n,2) of all points.
-        usable: which of them can be used.
-        needed: fewest points of a pose.
-    """
-    indices = usable.indices
-    if len(indices) < needed:
-        outside = int(np.count_nonzero(~usable.shown))
-        sizes = " or ".join(sorted({f"{w} x {h}" for w, h in (c.size for c in exposure.cameras)}))
-        hint = f"; {outside} lie outside the image of {sizes} pixels" if outside else ""
-        return Failure(
-            Reason.TOO_FEW_POINTS,
-            f"{len(indices)} usable points of {len(pixels)}, {needed} are needed{hint}",
-        )
-    if usable.extent < _LEAST_EXTENT:
-        return Failure(
-            Reason.DEGENERATE,
-            f"all {len(indices)} points lie within {usable.extent:.2g} pixels; are these "
-            "normalized coordinates? Pixels of the raw image are needed",
-        )
-    return None
 
 
 @entry

@@ -46,6 +46,11 @@ def test_a_digest_follows_callees_in_other_files():
     assert "rs_localizer.estimation.robust" not in sources.closure("rs_localizer.core.so3")
 
 
+def test_no_kernel_is_compiled_from_the_reasons():
+    closures = map(sources.closure, sources.kernel_modules())
+    assert not any("rs_localizer.core.reasons" in closure for closure in closures)
+
+
 @pytest.mark.parametrize(
     ("text", "is_same"),
     [
