@@ -9,14 +9,12 @@ Without that digest Numba would run old code after a callee in another file has 
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Sequence
-from typing import Any, Self
+from collections.abc import Callable
+from typing import Any
 
 import numba
 import numpy as np
-from numba import types
-from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba import config, types
 from numba.core.registry import CPUDispatcher
 
 from rs_localizer.native import sources
@@ -117,7 +115,10 @@ def compiled(function: Callable[..., Any], inline: bool, is_built: bool) -> Any:
     made.__class__ = _CompiledKernel
     path = sources.path_of_ours(function.__module__)
     if not is_built and path is not None and str(path) == function.__code__.co_filename:
-        made._cache = _Cache(function)
+        kept = sources.PACKAGE.parent / ".kernels" / sources.digest(function.__module__)[:16]
+        before, config.CACHE_DIR = config.CACHE_DIR, str(kept)
+        made.enable_caching()
+        config.CACHE_DIR = before
     return made
 
 
@@ -127,52 +128,3 @@ def entry(function: Callable[..., Any], is_built: bool, native: Any) -> Any:
     made.__class__, made.declared, made.native = _CompiledEntry, None, native
     ENTRIES[f"{function.__module__}.{function.__qualname__}"] = made
     return made
-
-
-# -- machine code in the checkout ------------------------------------------------------------------
-
-
-class _Locator:
-    """Numba's question where the machine code of a function is kept."""
-
-    def __init__(self, function: Any, file: str) -> None:
-        digest = sources.digest(function.__module__)
-        self._py_file = file  # Numba's name, for its warnings
-        kept = sources.PACKAGE.parent / ".kernels"
-        self._directory = kept / digest[:16] / function.__module__
-        self._digest, self._line = digest, function.__code__.co_firstlineno
-
-    @classmethod
-    def from_function(cls, function: Any, file: str) -> Self:
-        return cls(function, file)
-
-    def ensure_cache_path(self) -> None:
-        self._directory.mkdir(0o700, parents=True, exist_ok=True)
-
-    def get_cache_path(self) -> str:
-        return str(self._directory)
-
-    def get_source_stamp(self) -> str:
-        return self._digest
-
-    def get_disambiguator(self) -> str:
-        return str(self._line)
-
-
-class _Implementation(CompileResultCacheImpl):
-    _locator_classes: Sequence[type] = [_Locator]
-
-
-class _Cache(FunctionCache):
-    """Machine code of the checkout; a wrong file is compiled again."""
-
-    _impl_class = _Implementation
-
-    def load_overload(self, signature: Any, target: Any) -> Any:
-        with contextlib.suppress(Exception):  # half a file, or one of another program
-            return super().load_overload(signature, target)
-        return None
-
-    def save_overload(self, signature: Any, compiled: Any) -> None:
-        with contextlib.suppress(OSError):  # a full disk, or a folder that is read-only
-            super().save_overload(signature, compiled)
