@@ -7,6 +7,7 @@ recording was; the readers of this package take them and rclpy's messages alike.
 """
 
 import contextlib
+import re
 import shutil
 import sqlite3
 from collections.abc import Collection, Iterator, Mapping
@@ -30,19 +31,9 @@ from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from rs_localizer.io import detections
-from rs_localizer.io.containers import (
-    METADATA,
-    ZSTD,
-    data_files,
-    limit_rosbags,
-    read_magic,
-    storage,
-    unpack_file,
-    unpack_zstd,
-)
-from rs_localizer.io.reading import load_yaml, read_text
 from rs_localizer.io.topics import TF_STATIC
 
+_METADATA, _SUFFIXES = "metadata.yaml", (".mcap", ".db3", ".bag")
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 # Players advertise topics with the QoS recorded in the bag; subscribers to /tf_static expect
 # transient-local durability.
@@ -55,9 +46,6 @@ _LATCHED = Qos(
 
 class BagError(ValueError):
     """A recording that cannot be read or written; the message names the path and the fault."""
-
-
-limit_rosbags()
 
 
 @lru_cache(maxsize=1)
@@ -114,8 +102,6 @@ class BagReader:
             if self._reader.is2:
                 self._check_types({c.msgtype for c in wanted})
             for connection, stamp_ns, data in self._reader.messages(connections=wanted):
-                if data[: len(ZSTD)] == ZSTD and self._reader.is2:  # of a file without metadata
-                    data = unpack_zstd(data)
                 kind = normalize_msgtype(connection.msgtype)
                 message = self._reader.deserialize(data, kind)
                 if not self._reader.is2:
@@ -134,17 +120,13 @@ class BagReader:
 def open_bag(path: Path | str) -> Iterator[BagReader]:
     """Open a rosbag2 directory, a file of one, or a ROS 1 bag.
 
-    The first bytes of a file decide its kind (:mod:`rs_localizer.io.containers`).
-
     Raises:
         BagError: when there is no such recording, or it is damaged or empty.
     """
     path = Path(path)
     with contextlib.ExitStack() as stack:
         with _explained(path):
-            files, packed = _listed(path)
-            opened = stack.enter_context(storage(path, files, packed, unpack_file))
-            reader = stack.enter_context(AnyReader(opened, default_typestore=typestore()))
+            reader = stack.enter_context(AnyReader(_files(path), default_typestore=typestore()))
             bag = BagReader(path, reader)
             if bag.count(bag.topics) == 0:
                 raise BagError(f"{path} is an empty recording: it holds no message")
@@ -163,38 +145,35 @@ def _fields_of(name: str, defined: Mapping[str, Any]) -> Any:
 
 
 def is_bag(path: Path) -> bool:
-    """Return True for a recording, by its content; False for a video or a folder of images."""
+    """Return True for a recording; False for a video or a folder of images."""
     if path.is_dir():
-        return (path / METADATA).exists() or bool(data_files(path))
-    return bool(read_magic(path))
+        return (path / _METADATA).exists() or bool(_data_files(path))
+    return path.suffix in _SUFFIXES
 
 
-def _listed(path: Path) -> tuple[list[Path] | None, bool]:
-    """Return the files that a folder's metadata lists, and whether its content is packed.
+def _data_files(folder: Path) -> list[Path]:
+    """Return the recorded files of a folder, in the order of the numbers in their names."""
+    files = [file for file in folder.iterdir() if file.suffix in _SUFFIXES]
+    numbers = {file: [int(n) for n in re.findall(r"\d+", file.name)] for file in files}
+    return sorted(files, key=lambda file: (numbers[file], file.name))
 
-    None: there is none that can be used. A recorder that was killed leaves its data without it, or
-    an empty one.
+
+def _files(path: Path) -> list[Path]:
+    """Return what rosbags opens: files, or a folder with its metadata.
+
+    A recorder that was killed leaves its data without metadata, or with an empty file.
     """
     if not path.exists():
         raise BagError(f"{path} does not exist")
-    if not path.is_dir():
-        if path.is_file() and path.stat().st_size == 0:
-            raise BagError(f"{path} is an empty file")
-        if not path.is_file() or not read_magic(path):
-            raise BagError(
-                f"{path} is not a recording: expected a rosbag2 folder, or a file that is an MCAP, "
-                "a database of rosbag2 or a ROS 1 bag by its first bytes"
-            )
-        return None, False
-    if not (path / METADATA).is_file():
-        return None, False
-    tree = load_yaml(read_text(path / METADATA))  # with limits
-    about = tree.get("rosbag2_bagfile_information") if isinstance(tree, dict) else None
-    names = about.get("relative_file_paths") if isinstance(about, dict) else None
-    if not isinstance(about, dict) or not isinstance(names, list):
-        return None, False
-    packed = str(about.get("compression_mode") or "none").lower() != "none"
-    return [path / Path(str(name)).name for name in names], packed
+    if not is_bag(path):
+        raise BagError(
+            f"{path} is not a recording: expected a rosbag2 folder, or a file that ends in "
+            f"{', '.join(_SUFFIXES)}"
+        )
+    about = path / _METADATA
+    if path.is_dir() and not (about.is_file() and about.stat().st_size):
+        return _data_files(path)
+    return [path]
 
 
 @contextlib.contextmanager
@@ -207,6 +186,8 @@ def _explained(path: Path) -> Iterator[None]:
     except Exception as error:
         # A damaged file shows as errors of struct, sqlite, YAML, zstd, assertions and more.
         reason = " ".join(str(error).split()) or type(error).__name__
+        if "end magic" in reason:
+            reason = f"it is cut off: mcap recover {path.name} -o MENDED (https://mcap.dev)"
         raise BagError(f"{path} cannot be read as a recording: {reason}") from error
 
 

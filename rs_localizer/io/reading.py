@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Readers of text, YAML and JSON of people and programs, all with limits.
 
-Files come from others. A file that is larger than anybody writes, packs much more than it holds, or
-crashes the library that reads it, is refused in a sentence.
+Files come from others. A file that is larger than anybody writes, or crashes the library that reads
+it, is refused in a sentence.
 """
 
 import contextlib
@@ -140,19 +140,6 @@ def _checked(tree: Any, most: int) -> Any:
         elif isinstance(value, list | set | tuple):
             waiting += [(item, depth + 1) for item in value]
     return tree
-
-
-# -- packed data ------------------------------------------------------------------------------
-
-# Rendered images without noise, the best packed of all that anybody records, come to 40 times, and
-# a single small message may be all alike. What is large is measured, and comes to 4 times.
-BEST_PACKED, _ALIKE = 50, 2**24
-_MEASURED, _LARGE = 8, 2**27
-
-
-def most_unpacked(packed: int) -> int:
-    """Return the most bytes that this many packed bytes of a message or a text may become."""
-    return min(BEST_PACKED * packed + _ALIKE, max(_LARGE, _MEASURED * packed))
 
 
 # -- libraries that are not to be trusted with any file ------------------------------------------

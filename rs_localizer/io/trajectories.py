@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import gzip
 import io
-import math
 import zlib
 from array import array
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -28,13 +27,9 @@ from numpy.typing import NDArray
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import BagError, BagReader, is_bag, open_bag
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.reading import most_unpacked
 
 # Files round quaternions to four digits or more; what is further from 1 is no rotation.
 _QUATERNION_TOLERANCE = 0.01
-# No line of eight numbers is as long, no recording of days has as many: of packed text that few
-# bytes stand for.
-_LONGEST_LINE, _MOST_LINES = 10_000, 20_000_000
 # Seconds whose nanoseconds fit 64 bits.
 _LATEST = 9_223_372_036
 
@@ -189,16 +184,7 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> tuple[NDArray[np.int64]
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     try:
         with _open(path, "r") as file:
-            lines = iter(lambda: file.readline(_LONGEST_LINE + 1), "")
-            left = most_unpacked(path.stat().st_size) if path.suffix == ".gz" else math.inf
-            for number, line in enumerate(lines, start=1):
-                if (left := left - len(line)) < 0:
-                    raise TrajectoryError(f"{path} unpacks to more text than any trajectory does")
-                if len(line) > _LONGEST_LINE or number > _MOST_LINES:
-                    raise TrajectoryError(
-                        f"{path}, line {number}: lines have at most {_LONGEST_LINE} characters, "
-                        f"and there are at most {_MOST_LINES}"
-                    )
+            for number, line in enumerate(file, start=1):
                 stripped = line.strip()
                 if stripped and not stripped.startswith("#"):
                     yield number, stripped

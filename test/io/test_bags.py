@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from rs_localizer.io.bags import (
@@ -20,7 +19,6 @@ from rs_localizer.io.bags import (
     is_bag,
     make_message,
     open_bag,
-    typestore,
 )
 from rs_localizer.io.messages import make_header
 
@@ -61,9 +59,11 @@ def test_ros2_round_trip_in_order_of_time(tmp_path, storage):
 
 def test_killed_recorder_left_no_metadata(tmp_path):
     write_ros2(tmp_path / "bag", "mcap")
-    (tmp_path / "bag" / "metadata.yaml").unlink()
-    with open_bag(tmp_path / "bag") as bag:
-        assert bag.count(["/points"]) == 2
+    metadata = tmp_path / "bag" / "metadata.yaml"
+    for leave in (lambda: metadata.write_text(""), metadata.unlink):
+        leave()
+        with open_bag(tmp_path / "bag") as bag:
+            assert bag.count(["/points"]) == 2
 
 
 def test_ros1_has_the_names_of_ros2(tmp_path):
@@ -109,9 +109,9 @@ def test_nothing_is_overwritten(tmp_path):
     [
         ("absent", None, "absent does not exist"),
         ("notes.txt", b"hello", r"notes.txt is not a recording: expected a rosbag2 folder, or a"),
-        ("zero.mcap", b"", "zero.mcap is an empty file"),
-        ("wrong.mcap", b"hello" * 99, "wrong.mcap is not a recording"),
-        ("short.mcap", b"\x89MCAP0\r\n", "short.mcap is cut off"),
+        ("zero.mcap", b"", "zero.mcap.* seems to be empty"),
+        ("wrong.mcap", b"hello" * 99, "wrong.mcap cannot be read as a recording"),
+        ("short.mcap", b"\x89MCAP0\r\n", "short.mcap cannot be read as a recording"),
     ],
 )
 def test_what_is_no_recording_is_refused(tmp_path, name, content, expected):
@@ -142,33 +142,12 @@ def test_a_truncated_mcap_is_sent_to_who_mends_it(tmp_path):
     write_ros2(tmp_path / "bag", "mcap")
     data = cut(tmp_path / "bag", 0.7)
     for path in (tmp_path / "bag", data):  # with its metadata, and without
-        with pytest.raises(BagError, match=r"bag.mcap is cut off: mcap recover"), open_bag(path):
+        with pytest.raises(BagError, match=r"is cut off: mcap recover bag"), open_bag(path):
             pass
 
 
-@pytest.mark.parametrize("storage", STORAGES)
-@pytest.mark.parametrize("mode", ["FILE", "MESSAGE"])
-def test_packed_files_without_metadata(tmp_path, storage, mode):
-    """What a recorder packs, as a folder without metadata and as its file, whatever its name."""
-    writer = Writer(tmp_path / "bag", version=9, storage_plugin=STORAGES[storage])
-    writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
-    kind = "geometry_msgs/msg/PointStamped"
-    with writer:
-        connection = writer.add_connection("/points", kind, typestore=typestore())
-        writer.write(connection, 5, typestore().serialize_cdr(point(3, 3.0), kind))
-    (tmp_path / "bag" / "metadata.yaml").unlink()
-    (data,) = (tmp_path / "bag").iterdir()
-    odd = tmp_path / "download"
-    odd.write_bytes(data.read_bytes())
-    for path in (tmp_path / "bag", data, odd):
-        assert is_bag(path)
-        with open_bag(path) as bag:
-            ((topic, stamp, message),) = bag.messages(["/points"])
-        assert (topic, stamp, message.point.x) == ("/points", 5, 3.0)
-
-
 def test_parts_of_a_split_recording(tmp_path):
-    """Without metadata, or with metadata of files that were renamed; the tenth after the ninth."""
+    """Without metadata; the tenth after the ninth."""
     (tmp_path / "bag").mkdir()
     for part in range(11):
         with BagWriter(tmp_path / f"part{part}") as bag:
@@ -176,19 +155,8 @@ def test_parts_of_a_split_recording(tmp_path):
         (data,) = (file for file in (tmp_path / f"part{part}").glob("*.mcap"))
         data.rename(tmp_path / "bag" / f"rec_{part}.mcap")
     (tmp_path / "bag" / "0001.jpg").write_bytes(b"none")
-    (tmp_path / "part0" / "metadata.yaml").rename(tmp_path / "bag" / "metadata.yaml")
-    for _ in range(2):
-        with open_bag(tmp_path / "bag") as bag:
-            assert [stamp for _, stamp, _ in bag.messages(["/points"])] == list(range(11))
-        (tmp_path / "bag" / "metadata.yaml").unlink(missing_ok=True)
-
-
-def test_an_mcap_of_others_is_named(tmp_path):
-    write_ros2(tmp_path / "bag", "mcap")
-    (data,) = (tmp_path / "bag").glob("*.mcap")
-    data.write_bytes(data.read_bytes().replace(b"ros2", b"ros1", 1))
-    with pytest.raises(BagError, match=r"bag.mcap has the profile 'ros1'"), open_bag(data):
-        pass
+    with open_bag(tmp_path / "bag") as bag:
+        assert [stamp for _, stamp, _ in bag.messages(["/points"])] == list(range(11))
 
 
 def test_databases_of_others_are_no_recordings(tmp_path):
