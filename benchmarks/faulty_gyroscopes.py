@@ -26,9 +26,9 @@ from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.motions import hand
 from benchmarks.independent.rotations import Array, logarithm
 from benchmarks.independent.scenes import Rich, Scene, Wall
+from rs_localizer.core.reasons import Unused
 from rs_localizer.core.types import Estimate
 from rs_localizer.inertial.samples import SampleBuffer
-from rs_localizer.inertial.status import Unused
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
 

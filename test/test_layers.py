@@ -121,14 +121,18 @@ def test_what_few_need_is_imported_where_they_need_it():
 
 @pytest.mark.skipif(COMPILES, reason="kernels are not those of the native module, Numba runs them")
 def test_a_localizer_loads_nothing_that_few_need():
-    """No module but of what makes cameras and maps known, of commands, and of extras."""
+    """No module but of what makes cameras and maps known, of commands, and of extras.
+
+    The IMU's room is loaded with its first reading.
+    """
     apart = ("tools/", "cli/", "ros/", "native/", "__main__", *TRACED, "io/maps/colmap_process.py")
+    apart += ("inertial/",)
     modules = [
         ".".join(("rs_localizer", *path.relative_to(PACKAGE).with_suffix("").parts))
         for path in sorted(PACKAGE.rglob("*.py"))
         if not str(path.relative_to(PACKAGE)).startswith(apart)
     ]
-    names = [name for names in ONLY_IN for name in names]
+    names = ["rs_localizer.inertial", *(name for names in ONLY_IN for name in names)]
     code = (
         f"import importlib, sys\nfor name in {modules}:\n    importlib.import_module(name)\n"
         f"print(*[name for name in {names} if name in sys.modules])"

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Self
 
@@ -140,6 +141,14 @@ class ImuReason(_Explained):
         "one body? imu.time_offset, the transform of the frame_ids, units",
     )
     # fmt: on
+
+
+@dataclass(frozen=True, slots=True)
+class Unused:
+    """A reason for which a frame goes without its IMU, and what was found."""
+
+    reason: ImuReason
+    detail: str = ""
 
 
 class Notice(StrEnum):

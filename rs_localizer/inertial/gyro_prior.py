@@ -26,7 +26,7 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.reasons import ImuReason
+from rs_localizer.core.reasons import ImuReason, Unused
 from rs_localizer.core.rotation_prior import ROTATION, WHOLE, RotationPrior
 from rs_localizer.core.shake import COMBINATIONS, shake_functions
 from rs_localizer.core.shutter import Motion, carried, motion_of, numbers_of
@@ -47,7 +47,7 @@ from rs_localizer.estimation.prior import Prior, predicted, state_in
 from rs_localizer.estimation.window import MotionSample
 from rs_localizer.inertial.gravity import gravity_seen
 from rs_localizer.inertial.samples import ImuSamples
-from rs_localizer.inertial.status import InertialSettings, InertialStatus, Unused
+from rs_localizer.inertial.status import InertialSettings, InertialStatus
 from rs_localizer.inertial.turning import (
     BETWEEN,
     BIAS,

@@ -17,8 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
-from rs_localizer.core.reasons import ImuReason
-from rs_localizer.inertial.status import Unused
+from rs_localizer.core.reasons import ImuReason, Unused
 
 Vector = tuple[float, float, float]
 

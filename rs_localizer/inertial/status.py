@@ -10,15 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.reasons import ImuReason
-
-
-@dataclass(frozen=True, slots=True)
-class Unused:
-    """A reason for which a frame goes without its IMU, and what was found."""
-
-    reason: ImuReason
-    detail: str = ""
+from rs_localizer.core.reasons import Unused
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,25 +7,29 @@ the thread that localizes. The readings of a frame depend on stamps alone, not o
 arrival, so that a recording gives the same poses live and offline.
 """
 
+from __future__ import annotations
+
 import math
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from rs_localizer.config import Imu, ImuUse, NodeConfig
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.reasons import ImuReason
+from rs_localizer.core.reasons import ImuReason, Unused
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.known_rotation import Aid
-from rs_localizer.inertial.samples import ImuSamples, SampleBuffer
-from rs_localizer.inertial.status import InertialSettings, InertialStatus, Unused
 from rs_localizer.io.imu import ImuReading
 from rs_localizer.io.transforms import TransformError, Transforms
 from rs_localizer.pipeline.refusal import Notify
 from rs_localizer.tracking import Tracker
+
+if TYPE_CHECKING:  # without an IMU nobody needs them
+    from rs_localizer.inertial.samples import ImuSamples, SampleBuffer
+    from rs_localizer.inertial.status import InertialStatus
 
 # Readings around the exposure are used, because the spline needs neighbours, and the tracker needs
 # those since the last frame.
@@ -111,7 +115,7 @@ class AidInput:
 
     def __init__(self, notice: Notify) -> None:
         self._notice = notice
-        self._buffer = SampleBuffer()
+        self._buffer: SampleBuffer | None = None  # since the first reading
         self._recently: deque[Unused | None] = deque(maxlen=_MANY)
         self._force_in_map = np.zeros(3)  # mean of the last frames
         self._with_force = 0  # how many
@@ -126,6 +130,10 @@ class AidInput:
 
     def add(self, reading: ImuReading) -> None:
         """Take a reading."""
+        from rs_localizer.inertial.samples import SampleBuffer
+
+        if self._buffer is None:
+            self._buffer = SampleBuffer()
         self._buffer.add(
             reading.stamp_ns, reading.frame, reading.angular_velocity, reading.linear_acceleration
         )
@@ -133,13 +141,13 @@ class AidInput:
     @property
     def frame(self) -> str:
         """Frame of the readings' axes; empty as long as none has come."""
-        return self._buffer.frame
+        return "" if self._buffer is None else self._buffer.frame
 
     @property
     def state(self) -> AidState | None:
         """For the diagnostics; None as long as no frame has met an IMU."""
         recently = tuple(self._recently)
-        if not recently:
+        if not recently or self._buffer is None:
             return None
         estimated = math.nan if self._status is None else self._status.time_offset
         reasons = [unused.reason for unused in recently if unused is not None]
@@ -160,6 +168,7 @@ class AidInput:
         """Return True if missing readings of this exposure may come within so many seconds."""
         if not self._wanted(frame.config) or frame.tracker.aid is None:
             return False
+        assert self._buffer is not None
         missing_ns = self._buffer.lag(frame.exposure()[1] + _AROUND_NS)
         return 0 < missing_ns <= round((patience + _BUNDLE) * 1e9)
 
@@ -222,6 +231,7 @@ class AidInput:
         self, at: Moment, start_ns: int, end_ns: int, until_ns: int
     ) -> ImuSamples | Unused:
         """Return readings that cover a span, and those before and after it."""
+        assert self._buffer is not None
         samples = self._buffer.between(start_ns, end_ns, start_ns - _BEFORE_NS, until_ns)
         if isinstance(samples, Unused):
             return samples
@@ -272,14 +282,10 @@ def aid_of(config: NodeConfig, camera: Camera) -> Aid | None:
     """Return what a tracker knows of the gyroscope; None if no IMU is to be used."""
     if config.imu.use == ImuUse.NONE:
         return None
-    from rs_localizer.inertial.gyro_prior import GyroscopeTrack  # without an IMU nobody needs it
+    from rs_localizer.inertial.gyro_prior import GyroscopeTrack
+    from rs_localizer.inertial.status import InertialSettings
 
-    return GyroscopeTrack(inertial_settings(config), camera.readout_time)
-
-
-def inertial_settings(config: NodeConfig) -> InertialSettings:
-    """Return what is known of the IMU before any frame."""
-    return InertialSettings(
+    known = InertialSettings(
         gyroscope_noise=config.imu.gyroscope_noise,
         gyroscope_bias_walk=config.imu.gyroscope_bias_walk,
         scale_deviation=config.imu.scale_deviation,
@@ -288,6 +294,7 @@ def inertial_settings(config: NodeConfig) -> InertialSettings:
         or (_GIVEN_OFFSET if config.imu.time_offset else _ANY_OFFSET),
         gravity_in_map=np.array(config.gravity_in_map, float) if config.imu.gravity else None,
     )
+    return GyroscopeTrack(known, camera.readout_time)
 
 
 def in_camera_axes(

@@ -7,13 +7,13 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from rs_localizer.core.reasons import ImuReason
+from rs_localizer.core.reasons import ImuReason, Unused
 from rs_localizer.core.rotation_prior import ROTATION
 from rs_localizer.core.shake import COMBINATIONS, MIDDLE_RATES, MIDDLE_VALUES, shake_functions
 from rs_localizer.core.so3 import log
 from rs_localizer.core.types import Estimate
 from rs_localizer.inertial.gyro_prior import GyroscopeTrack
-from rs_localizer.inertial.status import InertialSettings, Unused
+from rs_localizer.inertial.status import InertialSettings
 from rs_localizer.inertial.turning import BETWEEN, GyroscopeErrors, read
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at

@@ -7,9 +7,8 @@ import random
 import numpy as np
 import pytest
 
-from rs_localizer.core.reasons import ImuReason
+from rs_localizer.core.reasons import ImuReason, Unused
 from rs_localizer.inertial.samples import MEMORY_NS, MOST, ImuSamples, SampleBuffer
-from rs_localizer.inertial.status import Unused
 
 MS = 1_000_000
 START = 1_700_000_000 * 10**9
