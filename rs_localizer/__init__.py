@@ -17,11 +17,7 @@ if TYPE_CHECKING:
     from rs_localizer.core.units import CameraState, camera_state
     from rs_localizer.estimation.prior import Prior
     from rs_localizer.io.camera_files import read_calibration
-    from rs_localizer.io.rigs import (
-        RigParts,
-        read_camchain,
-        write_camchain,
-    )
+    from rs_localizer.io.rigs import RigParts, read_camchain
     from rs_localizer.localizer import Localizer
     from rs_localizer.offline.frame_table import localize_recording
     from rs_localizer.solvers.minimal import solve_minimal
@@ -54,7 +50,6 @@ __all__ = [
     "read_camchain",
     "rectify",
     "solve_minimal",
-    "write_camchain",
 ]
 
 if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all others
@@ -72,7 +67,7 @@ if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all
         "core.units": ("CameraState", "camera_state"),
         "estimation.prior": ("Prior",),
         "io.camera_files": ("read_calibration",),
-        "io.rigs": ("RigParts", "read_camchain", "write_camchain"),
+        "io.rigs": ("RigParts", "read_camchain"),
         "localizer": ("Localizer",),
         "offline.frame_table": ("localize_recording",),
         "solvers.minimal": ("solve_minimal",),

@@ -318,30 +318,6 @@ def kalibr_camera(tree: dict[str, Any]) -> Camera:
     return Camera(width, height, pinhole_matrix(fx, fy, cx, cy), D, lens)
 
 
-def kalibr_fields(camera: Camera) -> dict[str, Any]:
-    """Return the entries of Kalibr's camchain for a camera's lens.
-
-    Raises:
-        ValueError: for a lens that it has no name for, or a binned or cropped image.
-    """
-    model, D = DistortionModel(camera.distortion_model), camera.D.tolist()
-    if camera.roi is not None or camera.binning != (1, 1):
-        raise ValueError("a camchain knows neither binning nor regions of the sensor")
-    sphere = str(model) in _KALIBR_SPHERES
-    names = {lens: name for name, lens in _KALIBR_LENSES.items() if name != "none"}
-    if (model not in names and not sphere) or (model == DistortionModel.PLUMB_BOB and any(D[4:])):
-        raise ValueError(f"Kalibr has no lens {model} with {len(D)} coefficients")
-    intrinsics = [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]]
-    plain = sphere or len(D) == 0
-    return {
-        "camera_model": str(model) if sphere else "pinhole",
-        "intrinsics": [float(value) for value in (*(D if sphere else ()), *intrinsics)],
-        "distortion_model": "none" if plain else names[model],
-        "distortion_coeffs": [] if plain else D[:4],
-        "resolution": [camera.width, camera.height],
-    }
-
-
 def lens_parameters(camera: Camera) -> dict[str, Any]:
     """Return ``lens`` of a ROS params file, for :func:`read_calibration`; nodes ignore it."""
     return {

@@ -24,7 +24,6 @@ from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-import yaml
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
@@ -32,7 +31,6 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.camera_files import (
     calibration_faults,
     kalibr_camera,
-    kalibr_fields,
     lens_camera,
     lens_parameters,
 )
@@ -88,33 +86,6 @@ def _read_own_rig(tree: Any) -> RigParts:
         poses[name] = pose[:3, :3].copy(), pose[:3, 3].copy()
         offsets[name] = float(values.get(f"{name}.stamp_offset", 0.0))
     return RigParts(cameras, poses, offsets)
-
-
-def write_camchain(path: Path, parts: RigParts) -> None:
-    """Write a camchain that :func:`read_camchain` reads as the same.
-
-    Raises:
-        ValueError: for a lens that Kalibr has no name for.
-    """
-    tree: dict[str, Any] = {}
-    poses = {name: _matrix(*pose) for name, pose in parts.camera_from_rig.items()}
-    offsets = {name: float(parts.time_offset.get(name, 0.0)) for name in parts.cameras}
-    first = next(iter(parts.cameras))
-    by_imu = bool(np.any(poses[first] != np.eye(4))) or any(offsets.values())
-    before = None
-    for name, camera in parts.cameras.items():
-        fields = kalibr_fields(camera)
-        if before is not None:
-            fields[_CHAIN] = (poses[name] @ np.linalg.inv(poses[before])).tolist()
-        if by_imu:
-            fields[_IMU], fields[_SHIFT] = poses[name].tolist(), offsets[name]
-        if camera.readout_time > 0.0:
-            fields |= {
-                "readout_time": camera.readout_time,
-                "scan_direction": str(camera.scan_direction),
-            }
-        tree[name], before = fields, name
-    path.write_text(yaml.safe_dump(tree, sort_keys=False, default_flow_style=None), "utf-8")
 
 
 def _camchain(tree: Any) -> RigParts:

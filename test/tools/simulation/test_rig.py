@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.clouds import read_correspondences
-from rs_localizer.io.rigs import RigParts, write_camchain
+from rs_localizer.io.rigs import RigParts, mounted_lenses, node_parameters
+from rs_localizer.settings import write_camera_file
 from rs_localizer.tools.simulation.simulated_rig import MountedMotion
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
@@ -43,7 +44,7 @@ def recording(tmp_path_factory):
     }
     poses = {"front": (np.eye(3), np.zeros(3)), "rear": (TURN, PLACE)}
     parts = RigParts(cameras, poses, {"front": 0.0, "rear": -0.25})
-    write_camchain(folder / "chain.yaml", parts)
+    write_camera_file(folder / "chain.yaml", node_parameters(parts), mounted_lenses(parts))
     out = folder / "seen"
     still = ("--duration", 1, "--noise", 0, "--outliers", 0)
     turn = ("--angular-velocity", 0.4, 0.8, -0.5)
