@@ -243,28 +243,22 @@ def test_a_click_begins_it_and_is_carried_by_odometry(made, robot, peer):
     assert node.notes[2][1].startswith("taken: map -> odom begins with it; odometry does not know")
 
 
-def test_points_in_the_frame_of_odometry_are_no_map(made, robot, peer):
-    node = made(publish_tf="map_to_odom", base_frame="base_link")
+def test_what_begins_no_transform_is_answered(made, robot, peer):
+    """Points in the frame of odometry, a click without a body, and one without odometry."""
+    node = made(publish_tf="map_to_odom", base_frame="base_link", transform_tolerance=0.0)
+    node.broadcaster.give(click(0.0, 5.0))
+    assert node.notes[-1][0] == "pose_given"
+    assert node.notes[-1][1].startswith("refused: ")
+    assert node.broadcaster.values["Last given pose"].startswith(node.notes[-1][1])
+    node.notes.clear()
     odometry(node, robot, peer, *range(50, 61))
     node.publish(replace(frame(5_500_000_000), map_frame="odom"))
     assert [notice for notice, _ in node.notes] == ["not_broadcast"]
     assert "the points are in 'odom', which is odom_frame" in node.notes[0][1]
-
-
-def test_a_click_without_a_body_is_refused(made):
     node = made(publish_tf="map_to_odom")
     node.broadcaster.give(click(0.0, 5.0))
     assert node.notes == [("pose_given", "refused: set base_frame, of which it is the pose")]
     made(publish_tf="map_to_camera").broadcaster.give(click(0.0, 5.0))
-
-
-def test_a_click_without_odometry_is_answered(made):
-    node = made(publish_tf="map_to_odom", base_frame="base_link", transform_tolerance=0.0)
-    node.broadcaster.give(click(0.0, 5.0))
-    notice, text = node.notes[-1]
-    assert notice == "pose_given"
-    assert text.startswith("refused: ")
-    assert node.broadcaster.values["Last given pose"].startswith(text)
 
 
 def test_the_last_pose_is_kept_and_started_from(made, robot, peer, tmp_path):
@@ -306,6 +300,9 @@ def rivals(node: Any) -> list[str]:
 
 
 def test_another_broadcaster_of_the_same_transform_is_seen(sending, robot, peer):
+    robot.send("map", "odom", 4.7, 5_400_000_000, NO_TURN)  # by this node before its restart
+    robot.send("map", "odom", 0.005, 6_300_000_000, NO_TURN)  # recorded of the same drive
+    peer.spin_until(lambda: False, 0.5)
     assert rivals(sending) == []
     robot.send("map", "odom", 4.7, 6_300_000_000, NO_TURN)
     assert peer.spin_until(lambda: rivals(sending))
@@ -313,6 +310,12 @@ def test_another_broadcaster_of_the_same_transform_is_seen(sending, robot, peer)
         "another node broadcasts map -> odom, too: (4.70, 0.00, 0.00) m, 0 deg instead of "
         "(0.00, 0.00, 0.00) m, 0 deg, which moves the body 4.7 m, "
     )
+    sending.broadcaster.jumped(-5.0)  # and after time has gone back
+    del sending.notes[:]
+    odometry(sending, robot, peer, *range(5, 16))
+    sending.publish(frame(10**9, x=1.0))
+    robot.send("map", "odom", 99.0, 1_300_000_000, NO_TURN)
+    assert peer.spin_until(lambda: rivals(sending))
 
 
 def test_a_static_one_is_seen_for_ever(sending, robot, peer):
@@ -340,14 +343,6 @@ def test_a_rival_is_seen_however_long_no_pose_has_come(sending, robot, peer):
     assert peer.spin_until(lambda: rivals(sending), 20.0)
 
 
-def test_a_rival_is_seen_after_time_has_gone_back(sending, robot, peer):
-    sending.broadcaster.jumped(-5.0)
-    odometry(sending, robot, peer, *range(5, 16))
-    sending.publish(frame(10**9, x=1.0))
-    robot.send("map", "odom", 99.0, 1_300_000_000, NO_TURN)
-    assert peer.spin_until(lambda: rivals(sending))
-
-
 def test_another_parent_of_what_it_sends_is_a_rival(sending, robot, peer, monkeypatch):
     robot.send("world", "odom", 4.7, 6_300_000_000, NO_TURN)
     assert peer.spin_until(lambda: rivals(sending))
@@ -362,13 +357,6 @@ def test_another_parent_of_what_it_sends_is_a_rival(sending, robot, peer, monkey
     robot.send("world", "odom", 4.7, 6_800_000_000, NO_TURN)
     odometry(sending, robot, peer, *range(67, 73))
     assert peer.spin_until(lambda: sending.broadcaster._sent_ns > 7_200_000_000, 20.0)
-
-
-def test_the_node_before_its_restart_and_a_recording_are_no_rivals(sending, robot, peer):
-    robot.send("map", "odom", 4.7, 5_400_000_000, NO_TURN)  # sent before this one began
-    robot.send("map", "odom", 0.005, 6_300_000_000, NO_TURN)  # recorded of the same drive
-    peer.spin_until(lambda: False, 0.5)
-    assert rivals(sending) == []
 
 
 def test_a_frame_that_has_two_parents_is_seen(sending, robot, peer):
