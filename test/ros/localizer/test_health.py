@@ -122,18 +122,20 @@ def silent(topic: str, cause: str, heard: bool = False) -> Silence:
 
 
 NOBODY = silent("/camera_info", "it has no publisher")
+RIVAL = {"oddities": {"second_broadcaster": "it is 4.7 m off"}}
+NO_FRAME = {"silence": {"correspondences": silent("/c", "no publisher", heard=True)}}
+NO_FRAME_SAID = "no frame has come for 7 s; /c: no publisher"
+NO_INFO = {"missing": ("camera_info",), "silence": {"camera_info": NOBODY, "keypoints": FRAMES}}
+NO_INFO_SAID = "waiting for camera_info; /camera_info: it has no publisher"
 
 
 @pytest.mark.parametrize(
     ("change", "level", "state", "message"),
     [
         ({"life_cycle": "inactive"}, Level.OK, "inactive", "the node is inactive: activate it"),
+        ({"life_cycle": "inactive"} | RIVAL, Level.OK, "inactive", "the node is inactive"),
         # Frames come, so that the other one is what is wrong.
-        (
-            {"missing": ("camera_info",), "silence": {"camera_info": NOBODY, "keypoints": FRAMES}},
-            Level.ERROR, "waiting for camera_info",
-            "waiting for camera_info; /camera_info: it has no publisher",
-        ),
+        (NO_INFO, Level.ERROR, "waiting for camera_info", NO_INFO_SAID),
         (
             {
                 "missing": ("camera_info", "map_points"),
@@ -141,58 +143,31 @@ NOBODY = silent("/camera_info", "it has no publisher")
             },
             Level.WARN, "waiting for camera_info and a map", "waiting for camera_info and a map",
         ),
-        (
-            {"silence": {"correspondences": silent("/c", "no publisher", heard=True)}},
-            Level.STALE, "waiting for frames", "no frame has come for 7 s; /c: no publisher",
-        ),
+        (NO_FRAME, Level.STALE, "waiting for frames", NO_FRAME_SAID),
         # One of two frame topics is enough.
         (
             {"silence": {"correspondences": FRAMES, "keypoints": silent("/k", "no publisher")}},
             Level.OK, "localized", "localized with 3 of 4 points",
         ),
+        # What is odd though there are poses.
+        ({"correction": Decision(CorrectionState(), Standing.CONTRADICTED)}, Level.ERROR,
+         "localized", "map -> odom is contradicted"),
+        ({"correction": Decision(CorrectionState(), Standing.HELD)}, Level.OK, "localized", ""),
+        ({"oddities": {"pixels_outside": "7 of 100"}}, Level.WARN, "localized",
+         "pixels_outside: 7 of 100"),
+        (RIVAL, Level.ERROR, "localized", "it is 4.7 m off"),
+        # A rival of a transform that a click has begun, or that is held, while nothing is seen.
+        (NO_FRAME | RIVAL, Level.ERROR, "waiting for frames",
+         f"{NO_FRAME_SAID}; it is 4.7 m off"),
+        (NO_INFO | RIVAL, Level.ERROR, "waiting for camera_info",
+         f"{NO_INFO_SAID}; it is 4.7 m off"),
     ],
 )  # fmt: skip
-def test_what_is_missing_comes_first(world, change, level, state, message):
+def test_what_is_missing_or_odd_comes_first(world, change, level, state, message):
     world.pass_frames(3, rate=50.0)
     health = world.diagnose(replace(GOOD, **change))
     assert (health.level, health.values["State"]) == (level, state)
     assert health.message.startswith(message)
-
-
-@pytest.mark.parametrize(
-    ("change", "level", "text"),
-    [
-        ({"correction": Decision(CorrectionState(), Standing.CONTRADICTED)}, Level.ERROR,
-         "map -> odom is contradicted"),
-        ({"correction": Decision(CorrectionState(), Standing.HELD)}, Level.OK, "localized"),
-        ({"oddities": {"second_broadcaster": "it is 4.7 m off"}}, Level.ERROR, "it is 4.7 m off"),
-        ({"oddities": {"pixels_outside": "7 of 100"}}, Level.WARN, "pixels_outside: 7 of 100"),
-    ],
-)  # fmt: skip
-def test_what_is_odd_though_there_are_poses(world, change, level, text):
-    world.pass_frames(10, rate=10.0)
-    health = world.diagnose(replace(GOOD, **change))
-    assert (health.level, health.state) == (level, "localized")
-    assert health.message.startswith(text)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"silence": {"correspondences": silent("/c", "no publisher")}},
-        {"silence": {"correspondences": silent("/c", "no publisher", heard=True)}},
-        {"missing": ("camera_info",), "silence": {"correspondences": silent("/c", "")}},
-    ],
-)
-def test_a_rival_is_an_error_while_the_camera_sees_nothing_too(world, change):
-    """A click has begun map -> odom, or it is held."""
-    rival = {"oddities": {"second_broadcaster": "it is 4.7 m off"}}
-    health, alone = world.diagnose(replace(GOOD, **change | rival)), replace(GOOD, **change)
-    assert health.level == Level.ERROR
-    assert health.state == world.diagnose(alone).state
-    assert health.message == f"{world.diagnose(alone).message}; it is 4.7 m off"
-    idle = world.diagnose(replace(GOOD, life_cycle="inactive", **rival))
-    assert idle.level == Level.OK
 
 
 def test_integrity_joins_its_pose():
