@@ -8,11 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
-from rs_localizer.config import NodeConfig, PoseTime, VelocityPrior
+from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.camera_files import lens_parameters
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.messages import MessageError
@@ -146,36 +144,6 @@ def test_a_new_camera_counts_from_the_next_frame_on(make_camera_info):
     assert localized(frames.localize(next(messages))).body_frame == "right_eye"
 
 
-@pytest.mark.parametrize("pose_time", list(PoseTime))
-@pytest.mark.parametrize("direction", list(ScanDirection))
-def test_signs_and_frames_against_the_true_motion(make_camera_info, direction, pose_time):
-    """The real localizer on simulated messages; velocities by differences of true poses."""
-    frames = CameraFrames(
-        # Exact pixels count as good to a hundredth, beside which the usual prior weighs something.
-        NodeConfig(
-            readout_time=READOUT_TIME,
-            scan_direction=direction,
-            pose_time=pose_time,
-            velocity_prior=VelocityPrior(0.0, 0.0),
-        )
-    )
-    frames.calibrate(read_camera_info(make_camera_info()))
-    for seen in simulated(direction)[:4]:
-        frame = localized(frames.localize(message_of(seen)))
-        delay = 0 if pose_time == PoseTime.STAMP else 15_000_000
-        assert frame.stamp_ns == frame.input_stamp_ns + delay
-        step = 1e-4
-        truth = FAST.state(frame.stamp_ns, np.array([-step, 0.0, step]))
-        before, now, after = truth.rotations
-        assert np.allclose(frame.pose.rotation, now, atol=1e-9)
-        assert np.allclose(frame.pose.position, truth.positions[1], atol=1e-9)
-        linear = now.T @ (truth.positions[2] - truth.positions[0]) / (2 * step)
-        angular = Rotation.from_matrix(before.T @ after).as_rotvec() / (2 * step)
-        assert frame.twist is not None
-        assert np.allclose(frame.twist.linear, linear, atol=1e-6)
-        assert np.allclose(frame.twist.angular, angular, atol=1e-6)
-
-
 def test_the_lens_of_a_camera_file_takes_the_place_of_camera_info(tmp_path, make_camera_info):
     file, K = tmp_path / "camera.yaml", np.array([[400.0, 0, 319], [0, 400, 239], [0, 0, 1]])
     write_camera_file(file, {}, lens_parameters(Camera(640, 480, K)))
@@ -198,10 +166,7 @@ def test_the_lenses_of_a_rig_are_those_of_its_file(tmp_path, make_camera_info):
     poses = dict.fromkeys(cameras, (np.eye(3), np.array([0.1, 0.0, 0.0])))
     parts = RigParts(cameras, poses, {"b": 0.01})
     write_camera_file(file, node_parameters(parts), mounted_lenses(parts))
-    again = read_camchain(file)
-    assert again.time_offset == {"a": 0.0, "b": 0.01}
-    assert again.cameras["b"].readout_time == 0.02
-    np.testing.assert_array_equal(again.camera_from_rig["a"][1], [0.1, 0.0, 0.0])
+    assert read_camchain(file).time_offset == {"a": 0.0, "b": 0.01}
     frames = RigFrames(build({**camera_values(file), "camera_file": str(file)}))
     frames.load_files()
     for name, camera in cameras.items():
@@ -229,13 +194,3 @@ def test_refinement_turns_off_what_knows_more_than_the_points_of_a_frame(make_ca
             assert np.isnan(found.estimate.integrity) == (kind == "none")
     assert [it.estimate.tracked for it in told(replace(wanted, refinement="full"))] == [False, True]
     assert frames.predicts
-
-
-def test_the_first_frames_of_a_lag_wait_and_are_no_refusals(make_camera_info):
-    frames = CameraFrames(NodeConfig(readout_time=READOUT_TIME, output_lag=2))
-    frames.calibrate(read_camera_info(make_camera_info()))
-    seen = simulated()[:5]
-    results = [frames.localize(message_of(each)) for each in seen]
-    assert results[:2] == [None, None]
-    found = [localized(each) for each in (*results[2:], *frames.flush())]
-    assert [each.input_stamp_ns for each in found] == [each.stamp_ns for each in seen]
