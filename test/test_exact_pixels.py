@@ -6,26 +6,28 @@ import numpy as np
 import pytest
 
 import rs_localizer as rsl
+from benchmarks.independent.cameras import Camera
 from rs_localizer import data
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
 from rs_localizer.tools.simulation.walls import three_walls
 from rs_localizer.tracking import Tracker
 
-READOUT, FOCAL, CENTRE, SIZE = 0.03, 500.0, np.array([319.5, 239.5]), np.array([640, 480])
-K = np.array([[FOCAL, 0.0, CENTRE[0]], [0.0, FOCAL, CENTRE[1]], [0.0, 0.0, 1.0]])
-LOCALIZER = rsl.Localizer(rsl.Camera(*SIZE, K, readout_time=READOUT))
+from .moving import camera_of
+
+TRUE = Camera(focal=500.0, distortion=(0.0,) * 5)
+SIZE = np.array([TRUE.width, TRUE.height])
+LOCALIZER = rsl.Localizer(camera_of(TRUE))
 
 
 def seen(hand, stamp_ns, points):
     """Pixels (n,2) of points (n,3) that the hand sees, each in its own row."""
-    delay = np.full(len(points), 0.5 * READOUT)
-    for _ in range(15):  # each leaves a ninth of what a turn of 200 deg/s is off by
-        state = hand.state(stamp_ns, delay)
-        local = np.einsum("nji,nj->ni", state.rotations, points - state.positions)
-        pixels = FOCAL * local[:, :2] / local[:, 2:] + CENTRE
-        delay = READOUT * np.clip(pixels[:, 1] / (SIZE[1] - 1.0), -1.0, 2.0)
-    return np.where(local[:, 2:] > 0.0, pixels, np.nan)
+
+    def local_at(delay):
+        state = hand.state(stamp_ns, np.nan_to_num(delay))
+        return np.einsum("nji,nj->ni", state.rotations, points - state.positions)
+
+    return TRUE.project_rolling(local_at, (len(points),))
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +44,7 @@ def frames():
         inside = np.all((quads > 2.0) & (quads < SIZE - 3.0), axis=(1, 2)) & (sides > 16.0)
         shown = np.repeat(inside, 4)
         if np.count_nonzero(shown) >= 12:
-            middle_ns = int(stamp_ns) + round(0.5e9 * READOUT)
+            middle_ns = int(stamp_ns) + round(0.5e9 * TRUE.readout_time)
             single = (array[shown].astype(np.float32) for array in (corners, pixels))
             turned = hand.state(middle_ns, np.zeros(1)).rotations[0]
             found.append((middle_ns, *single, turned))

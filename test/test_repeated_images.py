@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Images that come again bit for bit: of a camera that rests, or of a stream that hangs.
 
-Frames are projected by the tests' own means, each point at the time of its own row.
+Frames are those of the independent projector, each point at the time of its own row.
 """
 
 from dataclasses import replace
@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
+from benchmarks.independent.cameras import Camera
 from rs_localizer.core.shutter import Motion
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.inertial.gyro_prior import GyroscopeTrack
@@ -20,21 +21,24 @@ from rs_localizer.inertial.status import InertialSettings
 from rs_localizer.repeated_images import displacement
 from rs_localizer.tracking import Tracker
 
-READOUT, RATE = 0.03, 30.0
-K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
-CAMERA = rsl.Camera(640, 480, K, readout_time=READOUT)
+from .moving import camera_of, inside
+from .moving import shown as expose
+
+RATE = 30.0
+TRUE = Camera(focal=500.0, distortion=(0.0,) * 5)
+CAMERA = camera_of(TRUE)
 MAP = np.random.default_rng(0).uniform([-2.0, -1.5, 2.5], [2.0, 1.5, 5.0], (300, 3))
 
 
 def still(t):
-    return np.zeros(3), np.zeros(3)
+    return np.zeros((len(t), 3)), np.zeros((len(t), 3))
 
 
 def hand(t):
-    """Rotation vector and place, map_from_camera, at t s: some 0.9 rad/s all the time."""
+    """Rotation vectors and places, map_from_camera, at t s: some 0.9 rad/s all the time."""
     return (
-        0.12 * np.sin(2.0 * np.pi * t + np.arange(3)),
-        0.05 * np.sin(1.6 * np.pi * t + np.array([2.0, 0.0, 1.0])),
+        0.12 * np.sin(2.0 * np.pi * t[:, None] + np.arange(3)),
+        0.05 * np.sin(1.6 * np.pi * t[:, None] + np.array([2.0, 0.0, 1.0])),
     )
 
 
@@ -44,8 +48,8 @@ STOP = 0.3  # s; sooner, one in ten counts as hung (docs/limits.md)
 def stopping(t):
     """60 deg/s and 0.5 m/s that end within STOP."""
     late = np.clip((t - 0.5) / STOP, 0.0, 1.0)
-    gone = min(t, 0.5) + STOP * late * (1.0 - 0.5 * late)
-    return np.radians(60.0) * gone * np.array([0.6, 0.0, 0.8]), 0.5 * gone * np.array([1.0, 0, 0])
+    gone = (np.minimum(t, 0.5) + STOP * late * (1.0 - 0.5 * late))[:, None]
+    return np.radians(60.0) * gone * [0.6, 0.0, 0.8], 0.5 * gone * [1.0, 0.0, 0.0]
 
 
 def shown(moving, t, noise=0.0, seed=0, shift=(0.0, 0.0, 0.0)):
@@ -53,17 +57,16 @@ def shown(moving, t, noise=0.0, seed=0, shift=(0.0, 0.0, 0.0)):
 
     ``shift``: of points, from the axes that move to the camera's.
     """
-    pixels = np.tile(K[:2, 2], (len(MAP), 1))
-    for _ in range(8):
-        for k, point in enumerate(MAP):
-            turn, place = moving(t + READOUT * (np.clip(pixels[k, 1], 0.0, 479.0) / 479.0 - 0.5))
-            seen = Rotation.from_rotvec(turn).inv().apply(point - place) + shift
-            pixels[k] = K[:2, :2] @ (seen[:2] / seen[2]) + K[:2, 2]
-        if moving is still:
-            break
-    inside = np.flatnonzero(((pixels > 2.0) & (pixels < [637.0, 477.0])).all(axis=1))[:60]
-    pixels = pixels[inside] + noise * np.random.default_rng(seed).normal(size=(len(inside), 2))
-    return MAP[inside], pixels
+
+    def pose(after):
+        turns, places = moving(t + after)
+        rotations = Rotation.from_rotvec(turns)
+        return rotations, places - rotations.apply(shift)
+
+    pixels = expose(TRUE, pose, MAP)
+    seen = np.flatnonzero(inside(TRUE, pixels, margin=2.0))[:60]
+    pixels = pixels[seen] + noise * np.random.default_rng(seed).normal(size=(len(seen), 2))
+    return MAP[seen], pixels
 
 
 def ns(t):
@@ -86,7 +89,9 @@ def held():
 def angle(result, t):
     """Error of the orientation, deg."""
     return np.degrees(
-        (Rotation.from_matrix(result.rotation) * Rotation.from_rotvec(hand(t)[0])).magnitude()
+        (
+            Rotation.from_matrix(result.rotation) * Rotation.from_rotvec(hand(np.array([t]))[0][0])
+        ).magnitude()
     )
 
 
@@ -207,7 +212,7 @@ def test_displacement_is_what_samples_of_the_pose_say():
 
     def seen(turn, place):
         local = Rotation.from_rotvec(turn).inv().apply(points - place)
-        return local[:, :2] / local[:, 2:] @ K[:2, :2].T + K[:2, 2]
+        return TRUE.project(local)
 
     turn, place = np.array([0.01, -0.02, 0.005]), np.array([0.02, 0.01, 0.0])
     rotation = Rotation.from_rotvec(turn)
