@@ -137,41 +137,23 @@ def test_an_entry_is_pickled_by_its_name():
     assert "core.so3.exp" in repr(so3.exp.__self__)
 
 
-@pytest.mark.skipif(JITTED, reason="of the native module")
-def test_a_process_that_localizes_imports_no_compiler():
-    code = (
-        "import sys, numpy as np, rs_localizer as rsl\n"
-        "K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])\n"
-        "camera = rsl.Camera(640, 480, K, readout_time=0.03)\n"
-        "points = np.random.default_rng(0).uniform([-1, -1, 3], [1, 1, 5], (60, 3))\n"
-        "pixels = points[:, :2] / points[:, 2:] * 500 + (320, 240)\n"
-        "assert rsl.Localizer(camera).localize(points, pixels)\n"
-        "print({'numba', 'llvmlite', 'scipy'} & set(sys.modules))\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "set()\n"
-
-
 class Pair(typing.NamedTuple):
     one: float
     two: "np.ndarray"
 
 
-def test_an_annotation_that_says_too_little_is_refused():
-    def odd(x: np.ndarray) -> None: ...
+def odd(x: np.ndarray) -> None: ...
+def pair(x: Pair) -> None: ...
+def defaults(x: float = 0.0) -> None: ...
 
-    with pytest.raises(TypeError, match=r"x: .*says too little"):
-        declared.declaration(odd)
 
-    def pair(x: Pair) -> None: ...
-
-    with pytest.raises(TypeError, match=r"x: .*says too little"):
-        declared.declaration(pair)
-
-    def defaults(x: float = 0.0) -> None: ...
-
-    with pytest.raises(TypeError, match="neither defaults"):
-        declared.declaration(defaults)
+@pytest.mark.parametrize(
+    ("function", "said"),
+    [(odd, "x: .*says too little"), (pair, "x: .*says too little"), (defaults, "neither defaults")],
+)
+def test_an_annotation_that_says_too_little_is_refused(function, said):
+    with pytest.raises(TypeError, match=said):
+        declared.declaration(function)
 
 
 @pytest.mark.parametrize(
