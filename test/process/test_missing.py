@@ -38,44 +38,30 @@ def run(code: str, environment: dict[str, str], *words: str) -> subprocess.Compl
     return subprocess.run(command, env=environment, text=True, capture_output=True, check=False)
 
 
-@pytest.mark.parametrize(
-    ("name", "words", "advice"),
-    [
-        (
-            "scipy",
-            ("calibrate", "video.mp4"),
-            "sudo apt install python3-scipy, or pip install scipy",
-        ),
-        ("rosbags", ("evaluate", "a", "b"), f'pip install "rosbags{BOUNDS["rosbags"]}"; '),
-        ("rosbags", ("evaluate", "a", "b"), BESIDE_ROS),
-    ],
-)
-def test_a_command_says_it_in_one_line(tmp_path, name, words, advice):
-    done = run(COMMAND, without(tmp_path, name), *words)
-    assert done.returncode == 1
-    assert done.stderr.startswith(
-        f"rs_localizer {words[0]}: the Python package {name} is not installed: "
-    )
-    assert advice in done.stderr
-    assert done.stderr.count("\n") == 1
-
-
-PACKAGE = "the Python package {} is not installed: sudo apt install "
+MISSING = "the Python package {} is not installed: "
 
 
 @pytest.mark.parametrize(
-    ("name", "code", "said"),
+    ("name", "code", "words", "said", "advice"),
     [
-        ("numpy", NODE, f"localizer: {PACKAGE}"),
-        ("yaml", DETECTOR, f"marker_detector: {PACKAGE}"),
-        ("rclpy", NODE, "localizer: No module named '{}'; source a ROS 2 workspace"),
+        ("scipy", COMMAND, ("calibrate", "video.mp4"), f"rs_localizer calibrate: {MISSING}",
+         "sudo apt install python3-scipy, or pip install scipy"),
+        ("rosbags", COMMAND, ("evaluate", "a", "b"), f"rs_localizer evaluate: {MISSING}",
+         f'pip install "rosbags{BOUNDS["rosbags"]}"; '),
+        ("rosbags", COMMAND, ("evaluate", "a", "b"), f"rs_localizer evaluate: {MISSING}",
+         BESIDE_ROS),
+        ("numpy", NODE, (), f"localizer: {MISSING}", "sudo apt install "),
+        ("yaml", DETECTOR, (), f"marker_detector: {MISSING}", "sudo apt install "),
+        ("rclpy", NODE, (), "localizer: No module named '{}'; source a ROS 2 workspace", ""),
     ],
-)
-def test_a_node_says_it_in_one_line(tmp_path, name, code, said):
-    pytest.importorskip("rclpy", reason="needs ROS 2")
-    done = run(code, without(tmp_path, name))
+)  # fmt: skip
+def test_it_is_said_in_one_line(tmp_path, name, code, words, said, advice):
+    if code != COMMAND:
+        pytest.importorskip("rclpy", reason="needs ROS 2")
+    done = run(code, without(tmp_path, name), *words)
     assert done.returncode == 1
     assert done.stderr.startswith(said.format(name))
+    assert advice in done.stderr
     assert done.stderr.count("\n") == 1
 
 

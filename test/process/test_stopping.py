@@ -16,8 +16,9 @@ sys.path.insert(0, {folder!r})
 from rs_localizer.process.stopping import StopSignals
 class Finalized:
     def __del__(self):
-        os.kill(os.getpid(), {number})
+        os.kill(os.getpid(), signal.SIGHUP)
         time.sleep(0.1)
+StopSignals._interrupt.__globals__["_PATIENCE"] = {patience}
 with StopSignals():
     try:
         {body}
@@ -25,6 +26,16 @@ with StopSignals():
     except KeyboardInterrupt:
         print("interrupted")
 """
+
+
+def run(program: str, **variables: str) -> tuple[int, str, str]:
+    """Exit code, output and errors of a program."""
+    environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=environment | variables, text=True,
+        capture_output=True, check=False,
+    )  # fmt: skip
+    return done.returncode, done.stdout, done.stderr
 
 
 def test_a_process_that_is_being_started_is_not_lost():
@@ -46,28 +57,32 @@ with StopSignals():
         started.kill()
         print("ended", started.wait())
 """
-    ended = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False
-    )
-    assert ended.stdout == "ended -9\n", ended.stderr
+    assert run(program)[1] == "ended -9\n"
+
+
+# Is interrupted amidst an import; imports until it is ended, or for longer than a signal waits.
+HALF = "import os, time\nos.kill(os.getpid(), 2)\ntime.sleep(0.1)\nprint('whole')\n"
+LONG = "import os, time\nos.kill(os.getpid(), 15)\ntime.sleep(9999)\n"
+SHORT = "import time\ntime.sleep(1)\n"
+CLEAN_UP = "try: os.kill(os.getpid(), 15); time.sleep(9)\n        finally: import slow"
 
 
 @pytest.mark.parametrize(
-    ("body", "number"), [("import slow", signal.SIGINT), ("Finalized()", signal.SIGHUP)]
+    ("module", "body", "patience", "ended"),
+    [
+        # No interrupt is lost, nor raised where it would be lost, or leave half a module.
+        (HALF, "import slow", 9.0, (0, "whole\ninterrupted\n", "")),
+        (HALF, "Finalized()", 9.0, (0, "interrupted\n", "")),
+        # Who imports for long is ended, unless to clean up.
+        (LONG, "import slow", 0.1, (143, "", "interrupted\n")),
+        (SHORT, CLEAN_UP, 0.1, (0, "interrupted\n", "")),
+    ],
 )
-def test_no_interrupt_is_lost(tmp_path, number, body):
-    """Nor raised where it would be lost, or leave half a module."""
-    folder = f"{tmp_path}"
-    (tmp_path / "slow.py").write_text(
-        f"import os, time\nos.kill(os.getpid(), {number:d})\ntime.sleep(0.1)\nprint('whole')\n"
-    )
-    program = PROGRAM.format(folder=folder, number=int(number), body=body)
-    ended = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False
-    )
-    expected = ["whole", "interrupted"] if "slow" in body else ["interrupted"]
-    assert ended.stdout.split() == expected
-    assert (ended.returncode, ended.stderr) == (0, "")
+def test_imports_and_finalizers_are_interrupted_at_their_ends(
+    tmp_path, module, body, patience, ended
+):
+    (tmp_path / "slow.py").write_text(module)
+    assert run(PROGRAM.format(folder=f"{tmp_path}", body=body, patience=patience)) == ended
 
 
 @pytest.mark.parametrize(("number", "heard"), [(signal.SIGTERM, True), (signal.SIGHUP, False)])
@@ -81,35 +96,7 @@ with StopRequest() as stop:
     os.kill(os.getpid(), {number:d})
     print(stop.requested)
 """
-    said = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert said.stdout == f"{heard}\n"
-
-
-# Imports until it is ended, or for longer than a signal is patient.
-LONG = "import os, time\nos.kill(os.getpid(), 15)\ntime.sleep(9999)\n"
-SHORT = "import time\ntime.sleep(1)\n"
-CLEAN_UP = "try: os.kill(os.getpid(), 15); time.sleep(9)\n        finally: import slow"
-
-
-@pytest.mark.parametrize(
-    ("module", "body", "ended"),
-    [
-        (LONG, "import slow", (143, "", "interrupted\n")),
-        (SHORT, CLEAN_UP, (0, "interrupted\n", "")),
-    ],
-)
-def test_who_imports_for_long_is_ended_unless_to_clean_up(tmp_path, module, body, ended):
-    (tmp_path / "slow.py").write_text(module)
-    program = PROGRAM.format(folder=f"{tmp_path}", number=15, body=body)
-    program = program.replace(
-        "class", "StopSignals._interrupt.__globals__['_PATIENCE'] = 0.1\nclass"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False
-    )
-    assert (done.returncode, done.stdout, done.stderr) == ended
+    assert run(program) == (0, f"{heard}\n", "")
 
 
 # How many threads each OpenBLAS that this process has loaded would use, by its own word.
@@ -135,10 +122,5 @@ NODE = "from rs_localizer.ros.main import main; main(['--version'])"
     [(COMMAND, {}), (NODE, {}), (COMMAND, {"OPENBLAS_NUM_THREADS": "2"})],  # nor does a user
 )
 def test_one_thread_whose_bits_nobody_changes(program, variables):
-    inherited = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
-    done = subprocess.run(
-        [sys.executable, "-c", program + ASK], env=inherited | variables, text=True,
-        capture_output=True, check=True,
-    )  # fmt: skip
-    found = done.stdout.split("\n")[-2].split()
+    found = run(program + ASK, **variables)[1].split("\n")[-2].split()
     assert found == ["1"] * len(found)
