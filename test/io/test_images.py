@@ -103,23 +103,22 @@ def test_bayer(order, bits):
 
 
 @pytest.mark.parametrize(
-    ("encoding", "place"), [("yuv422", 1), ("uyvy", 1), ("yuv422_yuy2", 0), ("yuyv", 0)]
-)
-def test_yuv(encoding, place):
-    data = np.full((6, 8, 2), 128, np.uint8)
-    data[:, :, place] = GRAY
-    found = read_image(image(encoding, [row.tobytes() for row in data], 8))
-    np.testing.assert_array_equal(found.pixels, GRAY)
-
-
-@pytest.mark.parametrize("encoding", ["nv12", "nv21", "yuv420", "nv24"])
-def test_planes_of_which_the_first_is_the_brightness(encoding):
-    rows = ROWS + [bytes(8)] * (12 if encoding == "nv24" else 3)
-    message = image(encoding, rows, 8, 11)
-    message.height = len(GRAY)
+    ("encoding", "bytes_", "place", "after"),
+    [
+        ("yuv422", 2, 1, 0), ("uyvy", 2, 1, 0), ("yuv422_yuy2", 2, 0, 0), ("yuyv", 2, 0, 0),
+        ("nv12", 1, 0, 3), ("nv21", 1, 0, 3), ("yuv420", 1, 0, 3), ("nv24", 1, 0, 12),
+    ],
+)  # fmt: skip
+def test_brightness_beside_colour(encoding, bytes_, place, after):
+    """Within each pixel, or in the first plane, which rows of colour follow."""
+    data = np.full((6 + after, 8, bytes_), 128, np.uint8)
+    data[:6, :, place] = GRAY
+    rows = [row.tobytes() for row in data]
+    message = image(encoding, rows, 8, 8 * bytes_ + 3)
+    message.height = 6
     np.testing.assert_array_equal(read_image(message).pixels, GRAY)
-    message = image(encoding, rows[:7], 8)
-    message.height = len(GRAY)
+    message = image(encoding, rows[: 7 if after else 5], 8)
+    message.height = 6
     with pytest.raises(MessageError, match="the data are truncated"):
         read_image(message)
 
@@ -168,6 +167,7 @@ def test_jpeg_and_png():
         (JPEG[: len(JPEG) // 2], "jpeg", "the JPEG image is truncated: its .* no end mark"),
         (PNG[: len(PNG) // 2], "png", "the PNG image is truncated"),
         (b"\xff\xd8\xff\xd9", "jpeg", "the JPEG image of 4 bytes cannot be decoded"),
+        (JPEG[:2] + b"junk" + JPEG[2:], "jpeg", "cannot be decoded: no header has its size"),
     ],
 )
 def test_bad_compressed_images(data, name, text):
@@ -205,12 +205,6 @@ def jpeg_of(width: int, height: int) -> bytes:
     return JPEG[: start + 5] + size + JPEG[start + 9 : -2]
 
 
-def test_a_jpeg_that_hides_its_size_is_not_decoded():
-    hidden = JPEG[:2] + b"junk" + JPEG[2:]
-    with pytest.raises(MessageError, match="cannot be decoded: no header has its size"):
-        read_compressed_image(compressed(hidden))
-
-
 def test_an_animated_png_is_read_as_its_still_image():
     """OpenCV 5.0 ends the process by SIGSEGV; hence a process of its own."""
     rows = chunk(b"IDAT", zlib.compress((b"\0" + bytes(range(16))) * 12))
@@ -229,46 +223,38 @@ def test_an_animated_png_is_read_as_its_still_image():
     assert ended.stdout.split() == [b"(12,", b"16)"]
 
 
-MS = 1_000_000
-# Milliseconds of a phone that leaves images out: 10 images/s on average.
-OWN = [0, 33, 67, 100, 300]
+# ns of a phone that leaves images out: 10 images/s on average.
+OWN = [ms * 1_000_000 for ms in (0, 33, 67, 100, 300)]
 
 
-def test_presentation_times_from_one_second_on():
-    clock = ImageClock()
-    assert [clock.relative(ms * MS) for ms in OWN] == [10**9 + ms * MS for ms in OWN]
-    assert (clock.relative(None), clock.fault()) == (None, None)
-    assert clock.description() == (
-        "times: the presentation times of the video, 13.33 images/s on average; the first image at "
-        "1 s"
-    )
+@pytest.mark.parametrize(
+    ("rate", "stamps", "described", "fault"),
+    [
+        (None, OWN, "presentation times of the video, 13.33 images/s on average", None),
+        (30.0, [round(k * 1e9 / 30) for k in range(5)], "times: --rate 30; the first image at 1 s",
+         "30 disagrees with the file, whose own times mean 13.33 images/s"),
+        (13.34, [round(k * 1e9 / 13.34) for k in range(5)], "--rate 13.34", None),
+    ],
+)  # fmt: skip
+def test_times_of_a_video_begin_at_one_second(rate, stamps, described, fault):
+    clock = ImageClock(rate)
+    assert [clock.relative(own) for own in OWN] == [10**9 + stamp for stamp in stamps]
+    assert described in clock.description()
+    assert (clock.relative(None) is None) == (rate is None)
+    assert clock.fault() is None if fault is None else fault in clock.fault()
 
 
-def test_a_rate_overrides_and_is_compared():
-    clock = ImageClock(rate=30.0)
-    stamps = [clock.relative(ms * MS) for ms in OWN]
-    assert stamps == [10**9 + round(k * 1e9 / 30) for k in range(5)]
-    assert clock.description() == "times: --rate 30; the first image at 1 s"
-    assert "30 disagrees with the file, whose own times mean 13.33 images/s" in clock.fault()
-    near, without = ImageClock(rate=13.34), ImageClock(rate=30.0)
-    assert all(near.relative(ms * MS) for ms in OWN)
-    assert without.relative(None) == 10**9
-    assert (near.fault(), without.fault()) == (None, None)
-
-
-def test_names_that_are_times():
+def test_times_of_names_and_none():
     clock = ImageClock()
     assert [clock.absolute(10**18 + k) for k in (0, 7)] == [10**18, 10**18 + 7]
     assert "the names of the files" in clock.description()
-
-
-@pytest.mark.parametrize("first", [(), (0,)])  # the first of some files has a time, always
-def test_without_times_there_must_be_a_rate(first):
+    clock = ImageClock(rate=30.0)
+    assert (clock.relative(None), clock.fault()) == (10**9, None)
     clock = ImageClock()
-    for own_ns in first:
-        clock.relative(own_ns)
-    with pytest.raises(TimesError, match="give --rate"):
-        clock.relative(None)
+    clock.relative(0)  # the first of some files has a time, always
+    for without in (ImageClock(), clock):
+        with pytest.raises(TimesError, match="give --rate"):
+            without.relative(None)
 
 
 def test_a_readout_longer_than_a_period():
