@@ -3,6 +3,7 @@
 """Figures of docs/benchmarks.md are what the benches printed; those of README are among them."""
 
 import re
+from collections.abc import Iterable
 
 import pages
 import PIL.Image
@@ -34,18 +35,28 @@ def test_every_block_is_what_its_bench_printed():
     assert widest <= 100
 
 
+def unprinted(said: str, printed: Iterable[str]) -> list[str]:
+    """Numbers of a text that no bench printed, rounded as they are, also as shares in %."""
+    known = [float(number) for text in printed for number in NUMBER.findall(text)]
+    near = [x for value in known for x in (value, 100.0 * value)]
+
+    def digits(number: str) -> int:
+        return len(number.partition(".")[2])
+
+    return [
+        number
+        for number in NUMBER.findall(said)
+        if float(number) not in {round(x, digits(number)) for x in near}
+    ]
+
+
 @pytest.mark.parametrize("row", ROWS, ids=[row[0][:40] for row in ROWS])
 def test_every_figure_of_readme_is_in_the_block_that_it_links_to(row):
     named = re.search(r"\]\[(\w+)\]", row[0])
     target = re.search(
         rf"^\[{named[1]}\]: docs/benchmarks\.md#(\S+)$", pages.text("README.md"), re.M
     )
-    printed = section(target[1])
-    known = [float(number) for text in blocks(printed).values() for number in NUMBER.findall(text)]
-    for number in NUMBER.findall(" ".join(row[1:])):
-        digits = len(number.partition(".")[2])
-        near = [x for value in known for x in (value, 100.0 * value)]
-        assert float(number) in {round(x, digits) for x in near}, number
+    assert unprinted(" ".join(row[1:]), blocks(section(target[1])).values()) == []
 
 
 @pytest.mark.parametrize("item", REST, ids=[item[:20] for item in REST])
@@ -72,34 +83,12 @@ def test_figures_of_a_sentence_are_in_the_tables_that_it_links_to(page, said):
     printed = [*blocks(part).values()]
     linked = re.findall(r"\]\(\.\./benchmarks/results/([\w-]+)\.txt\)", part)
     printed += [(RESULTS / f"{name}.txt").read_text(encoding="utf-8") for name in linked]
-    known = [float(number) for text in printed for number in NUMBER.findall(text)]
-    figures = re.sub(r"`[^`]*`|\]\([^)]*\)", "", said)
-    for number in NUMBER.findall(figures):
-        digits = len(number.partition(".")[2])
-        near = {round(x, digits) for value in known for x in (value, 100.0 * value)}
-        assert float(number) in near, (page, number)
-
-
-def test_the_picture_of_errors_is_of_the_run_whose_medians_are_printed():
-    rows = (RESULTS / "demo.txt").read_text(encoding="utf-8").splitlines()
-    columns = rows[0].split()[1:]
-    with PIL.Image.open(pages.ROOT / "docs" / "errors.png") as picture:
-        drawn = picture.text["Description"].split("; ")
-    assert len(drawn) == 6
-    for each in drawn:
-        quantity, solver, median = re.fullmatch(r"(.+), (\w+): (\S+)", each).groups()
-        name, scale = quantity.replace("(m)", "(mm)"), 1e3 if "(m)" in quantity else 1.0
-        (row,) = [row for row in rows if re.match(rf"Simulated flight.*: {re.escape(name)} ", row)]
-        printed = row.rsplit(")", 1)[1].split()[columns.index(solver)]
-        # The picture has three digits, the page two.
-        assert float(printed) == pytest.approx(scale * float(median), rel=0.035)
+    assert unprinted(re.sub(r"`[^`]*`|\]\([^)]*\)", "", said), printed) == [], page
 
 
 def test_the_words_below_the_picture_of_errors_are_its_medians():
-    alt = re.search(r"!\[(Errors of position[^]]*)\]\(docs/errors\.png\)", pages.text("README.md"))[
-        1
-    ]
-    millimetres, degrees = map(float, re.search(r"(\S+) mm and (\S+) deg", alt).groups())
+    alt = re.search(r"!\[(Errors of position[^]]*)\]\(docs/errors\.png\)", pages.text("README.md"))
+    millimetres, degrees = map(float, re.search(r"(\S+) mm and (\S+) deg", alt[1]).groups())
     with PIL.Image.open(pages.ROOT / "docs" / "errors.png") as picture:
         drawn = dict(each.rsplit(": ", 1) for each in picture.text["Description"].split("; "))
     assert millimetres == round(1e3 * float(drawn["position (m), r6p_vcwt"]))
