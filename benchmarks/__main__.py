@@ -74,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return real.main(argv[1:])
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks",
-        description="The experiments of the literature and ours: curves, figures, a verdict on "
+        description="The experiments of the literature and ours: curves and a verdict on "
         "every claim.",
         epilog=_TOOLS,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -91,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of all random numbers (default: 0)")
     parser.add_argument(
         "--out", type=Path, default=Path("experiments"), metavar="DIR",
-        help=f"directory for tables (CSV), figures (PNG) and {SUMMARY} (default: %(default)s)",
+        help=f"directory for tables (CSV), a figure (PNG) and {SUMMARY} (default: %(default)s)",
     )  # fmt: skip
     args = parser.parse_args(argv)
     unknown = [name for name in args.names if name not in EXPERIMENTS]

@@ -5,22 +5,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatterSciNotation
 from scipy.spatial.transform import Rotation
 
-from benchmarks.experiments import charts
 from benchmarks.experiments import methods as m
 from benchmarks.experiments.methods import Method
 from benchmarks.experiments.results import Claim, Context, Result, Table, limited
 from benchmarks.experiments.sweeps import (
-    METRICS,
     ORIENTATION,
     POSE,
-    POSITION,
     Curves,
     motion_errors,
     sweep,
@@ -100,8 +94,7 @@ def run(context: Context) -> Result:
                 ],
             ),
         },
-        {"convergence": _figure(by_count, algebraic)},
-        [_shown(by_count), _shown_algebraic(algebraic)],
+        notes=[_shown(by_count), _shown_algebraic(algebraic)],
     )  # fmt: skip
 
 
@@ -195,8 +188,7 @@ def _over(
     one: Curves, other: Curves, method: Method, of_other: Method | None = None
 ) -> list[float]:
     """Ratios of pose errors, the larger of orientation and position, while something moves."""
-    pose = [ORIENTATION, POSITION]
-    ratios = one.moving(method)[:, pose] / other.moving(of_other or method)[:, pose]
+    ratios = one.moving(method)[:, POSE] / other.moving(of_other or method)[:, POSE]
     return [float(value) for value in ratios.max(axis=1)]
 
 
@@ -222,25 +214,3 @@ def _shown_algebraic(algebraic: dict[str, Array]) -> str:
 
 def _short(value: float) -> str:
     return f"{value:.2g}"
-
-
-def _figure(by_count: dict[int, Curves], algebraic: dict[str, Array]) -> Figure:
-    drawn = charts.figure(12.0, 6.6)
-    panels: Any = drawn.subplots(2, 4, squeeze=False)
-    labels = list(METRICS.values())
-    for column, (count, curves) in enumerate(by_count.items()):
-        for row, metric in enumerate((ORIENTATION, POSITION)):
-            axes = panels[row][column]
-            for method in _METHODS:
-                charts.line(axes, curves.x[1:], curves.medians(method)[1:, metric], method)
-            axes.set_title(f"{count} iteration{'s' if count > 1 else ''}", fontsize="medium")
-            charts.tidy(axes, "rotation (deg per frame)", labels[metric], logarithmic=True)
-    panels[1][3].set_visible(False)
-    axes = panels[0][3]
-    for method in _LINEAR:
-        charts.line(axes, np.array(_STEPS, float), algebraic[method.name], method)
-    axes.set_title("at 15 deg per frame", fontsize="medium")
-    charts.tidy(axes, "iterations", "algebraic error", logarithmic=True)
-    axes.yaxis.set_major_formatter(LogFormatterSciNotation())
-    charts.legend(drawn, panels[0][0])
-    return drawn

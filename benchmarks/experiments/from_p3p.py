@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.experiments import charts
 from benchmarks.experiments import methods as m
 from benchmarks.experiments.motion import equal_to_r6p
 from benchmarks.experiments.results import Context, Result, limited
@@ -18,7 +17,6 @@ from benchmarks.experiments.trials import Setting
 _SPEEDS = (0.0, 3.0, 6.0, 9.0, 12.0, 15.0, 20.0, 25.0, 30.0)  # deg per frame
 _TRANSLATION = 0.01  # per degree
 _METHODS = (m.P3P, m.R6P, *m.TWO_STEP, m.VCWT, m.VCWT_OURS, m.R9P, m.R9P_OURS)
-_X_LABEL = "rotation (deg per frame); translation: 0.01 of it"
 
 
 def run(context: Context) -> Result:
@@ -54,11 +52,7 @@ def run(context: Context) -> Result:
             equal_to_r6p("from-p3p", [five]),
         ],
         {"from_p3p_1": once.table(), "from_p3p_5": five.table(), "from_p3p_noisy": noisy.table()},
-        {
-            "from_p3p": charts.error_figure(once, _METHODS, _X_LABEL),
-            "from_p3p_noisy": charts.error_figure(noisy, _METHODS, _X_LABEL),
-        },
-        [
+        notes=[
             each.orientations("deg", 6.0, 15.0, 30.0).replace("motion", f"from P3P{noise}", 1)
             for each, noise in ((once, ""), (noisy, ", 1 px"))
         ],

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.experiments import charts
 from benchmarks.experiments import methods as m
 from benchmarks.experiments.motion import equal_to_r6p
 from benchmarks.experiments.results import Claim, Context, Result, limited
@@ -60,10 +59,5 @@ def run(context: Context) -> Result:
             ),
         ],
         {"linearisation": straight.table(), "linearisation_drifting": drifting.table()},
-        {
-            "linearisation": charts.error_figure(
-                straight, _METHODS, "initial orientation off by (deg)", skip_zero=False
-            )
-        },
-        [straight.orientations("deg", 0.0, 6.0, 15.0, 30.0).replace("motion", "start off by", 1)],
+        notes=[straight.orientations("deg", 0, 6, 15, 30).replace("motion", "start off by", 1)],
     )  # fmt: skip

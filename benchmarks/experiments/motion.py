@@ -12,7 +12,7 @@ from benchmarks.experiments import charts
 from benchmarks.experiments import methods as m
 from benchmarks.experiments.methods import Method
 from benchmarks.experiments.results import Claim, Context, Result, limited
-from benchmarks.experiments.sweeps import ORIENTATION, POSE, POSITION, Curves, T, W, sweep
+from benchmarks.experiments.sweeps import POSE, Curves, T, W, sweep
 from benchmarks.experiments.trials import Setting
 
 _SPEEDS = tuple(np.linspace(0.0, 30.0, 11).tolist())
@@ -21,7 +21,7 @@ _X_LABEL = "rotation (deg per frame); translation: 0.01 of it"
 # Medians below these are rounding, not error.
 _FLOOR = np.array([1e-6, 1e-8, 1e-6, 1e-8])
 # What a user chooses from, in the form in which they get it.
-CHOICE = (m.P3P, m.R6P, m.VCT_W, m.VCWT_OURS, m.R9P_OURS, m.JOINT, m.REFINED)
+_CHOICE = (m.P3P, m.R6P, m.VCT_W, m.VCWT_OURS, m.R9P_OURS, m.JOINT, m.REFINED)
 _FAST = 15.0  # deg per frame
 
 
@@ -82,13 +82,7 @@ def run(context: Context) -> Result:
             "motion_noisy": noisy.table(),
             "motion_drifting": drifting.table(),
         },
-        {
-            "motion": charts.error_figure(exact, (*m.PAPERS, m.REFINED), _X_LABEL),
-            "motion_noisy": charts.error_figure(noisy, (*m.PAPERS, m.REFINED), _X_LABEL),
-            "choosing_motion": charts.error_figure(
-                noisy, CHOICE, _X_LABEL, (ORIENTATION, POSITION)
-            ),
-        },
+        {"choosing_motion": charts.error_figure(noisy, _CHOICE, _X_LABEL)},
         [noisy.orientations("deg", 0.0, 15.0, 30.0)],
     )  # fmt: skip
 

@@ -7,9 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
 
-from benchmarks.experiments import charts
 from benchmarks.experiments import methods as m
 from benchmarks.experiments.methods import Method, observed, states
 from benchmarks.experiments.results import Claim, Context, Result, Table, limited
@@ -21,7 +19,6 @@ from rs_localizer.estimation.projection import normal_equations
 
 _NOISES = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
 _SPEED, _TRANSLATION = 20.0, 0.2  # deg and units per frame
-_X_LABEL = "noise (px)"
 # Shares of the points that a six-point model may see within so many px, at most.
 _SEEN = {2.0: 0.20, 4.0: 0.45, 8.0: 0.75}
 _SIX = 6
@@ -39,12 +36,6 @@ def run(context: Context) -> Result:
     squared = [x.squared_errors(state) for x, state in zip(observed(trials), found, strict=True)]
     seen = np.sqrt(np.array(squared)[:, _SIX:])
     refined = motion_errors(m.estimate(m.REFINED, trials, noise=1.0), trials.truth)[:, ORIENTATION]
-
-    def draw_bounds(axes: Axes, metric: int) -> None:
-        for style, (n, bound) in zip(("--", ":"), bounds.items(), strict=True):
-            if metric < len(bound):
-                axes.plot(curves.x[1:], curves.x[1:] * bound[metric], style, color="#707070",
-                          linewidth=2.0, label=f"bound, {n} points")  # fmt: skip
 
     return Result(
         "Noise",
@@ -93,12 +84,7 @@ def run(context: Context) -> Result:
                 [(n, *map(float, bound)) for n, bound in bounds.items()],
             ),
         },
-        {
-            "noise": charts.error_figure(
-                curves, (*m.PAPERS, m.REFINED), _X_LABEL, skip_zero=False, decorate=draw_bounds
-            )
-        },
-        [curves.orientations("px", 0.0, 1.0, 4.0).replace("motion", "noise", 1)],
+        notes=[curves.orientations("px", 0.0, 1.0, 4.0).replace("motion", "noise", 1)],
     )  # fmt: skip
 
 

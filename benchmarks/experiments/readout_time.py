@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.data import HAND_MOTION
-from benchmarks.experiments import charts
 from benchmarks.experiments.results import Context, Result, Table, limited
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -71,16 +70,6 @@ def run(context: Context) -> Result:
     inside = [abs(trial.error) < 1.96 * trial.found.deviation for trial in trials]
     still = [trial.found.global_shutter for trial in trials if trial.truth == 0.0]
     taken = [verdict.readout_time(trial.found) == 0.0 for trial in moving]
-    drawn = charts.figure(7.0, 3.6)
-    axes = drawn.subplots()
-    axes.errorbar(
-        np.arange(count),
-        [1e6 * trial.error for trial in trials],
-        [1.96e6 * trial.found.deviation for trial in trials],
-        fmt=".",
-    )
-    axes.axhline(0.0, color="#c9c9c9")
-    charts.tidy(axes, "recording", "error of the readout time (us), 95 %")
     said = (
         f"{count} recordings of {seconds:g} s: median error "
         f"{1e6 * np.median([abs(t.error) for t in moving]):.0f} us, {ratio:.2f} of the "
@@ -126,7 +115,7 @@ def run(context: Context) -> Result:
                 ],
             )
         },
-        {"readout_time": drawn}, [said],
+        notes=[said],
     )  # fmt: skip
 
 

@@ -8,10 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from benchmarks.data import PHONE, PHONE_GYROSCOPE
-from benchmarks.experiments import charts
 from benchmarks.experiments import methods as m
 from benchmarks.experiments.methods import Method
 from benchmarks.experiments.results import Context, Result, Table, limited
@@ -93,8 +91,7 @@ def run(context: Context) -> Result:
                 ],
             )
         },
-        {"sequences": _figure(found, places)},
-        [_shown(found, fast)],
+        notes=[_shown(found, fast)],
     )  # fmt: skip
 
 
@@ -162,13 +159,3 @@ def _shown(found: Mapping[str, Array], fast: BoolArray) -> str:
     fastest, every = f"fastest {_FASTEST}", f"all {len(fast)}"
     heading = [f"{which}, {px:g} px" for which in (fastest, every) for px in _WITHIN]
     return Table(("Fig. 6: share of the points", *heading), rows).text()
-
-
-def _figure(found: Mapping[str, Array], places: Array) -> Figure:
-    drawn = charts.figure(9.6, 4.2)
-    axes = drawn.subplots()
-    for method in _METHODS:
-        charts.line(axes, places, found[method.name][:, 1], method)
-    charts.tidy(axes, "image of the phone", f"share of the points within {_THRESHOLD:g} px")
-    charts.legend(drawn, axes)
-    return drawn

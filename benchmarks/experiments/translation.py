@@ -6,16 +6,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.experiments import charts
 from benchmarks.experiments import methods as m
-from benchmarks.experiments.motion import CHOICE, joint_is_best
+from benchmarks.experiments.motion import joint_is_best
 from benchmarks.experiments.results import Context, Result, limited
 from benchmarks.experiments.sweeps import ORIENTATION, POSITION, T, crossing, sweep
 from benchmarks.experiments.trials import Setting
 
 _SPEEDS = tuple(np.linspace(0.0, 0.3, 11).tolist())
 _FROM = 0.1  # per frame
-_X_LABEL = "translation per frame"
 _REST = (
     "Below {:.3f} per frame P3P has the best orientation: noise outweighs the motion.\n"
     "P3P's is the triplet nearest to the truth, which nobody can pick."
@@ -51,11 +49,5 @@ def run(context: Context) -> Result:
             joint_is_best("translation", curves),
         ],
         {"translation": curves.table()},
-        {
-            "translation": charts.error_figure(curves, (*m.PAPERS, m.JOINT, m.REFINED), _X_LABEL),
-            "choosing_translation": charts.error_figure(
-                curves, CHOICE, _X_LABEL, (ORIENTATION, POSITION)
-            ),
-        },
-        [curves.orientations("per frame", 0.0, 0.15, 0.3), _REST.format(passes)],
+        notes=[curves.orientations("per frame", 0.0, 0.15, 0.3), _REST.format(passes)],
     )  # fmt: skip
