@@ -28,14 +28,7 @@ from benchmarks.experiments import (
     timings,
     translation,
 )
-from benchmarks.experiments.results import (
-    SUMMARY,
-    Context,
-    Result,
-    verdicts,
-    write_result,
-    write_summary,
-)
+from benchmarks.experiments.results import Claim, Context, Result, verdicts
 from benchmarks.real import __main__ as real
 
 T = TypeVar("T")
@@ -91,7 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of all random numbers (default: 0)")
     parser.add_argument(
         "--out", type=Path, default=Path("experiments"), metavar="DIR",
-        help=f"directory for tables (CSV), a figure (PNG) and {SUMMARY} (default: %(default)s)",
+        help="directory for the figure of docs/solvers.md (default: %(default)s)",
     )  # fmt: skip
     args = parser.parse_args(argv)
     unknown = [name for name in args.names if name not in EXPERIMENTS]
@@ -110,23 +103,21 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run(args: argparse.Namespace) -> None:
-    args.out.mkdir(parents=True, exist_ok=True)
-    results: dict[str, Result] = {}
+    claims: list[Claim] = []
     for name in dict.fromkeys(args.names or EXPERIMENTS):
         start = time.perf_counter()
         context = Context(args.trials, args.seed, partial(_track, name))
-        results[name] = EXPERIMENTS[name](context)
-        write_result(args.out, results[name])
-        # After each, so that an interrupted run leaves what it found.
-        write_summary(args.out, results, context)
+        result = EXPERIMENTS[name](context)
+        for file, figure in result.figures.items():
+            args.out.mkdir(parents=True, exist_ok=True)
+            figure.savefig(args.out / f"{file}.png")
         sys.stderr.write(f"{name} ({time.perf_counter() - start:.0f} s)\n")
-        for one in results[name].claims:
+        for one in result.claims:
             said = f"  {one.verdict:13} {one.statement}: {one.finding} ({one.criterion})\n"
-            sys.stderr.write(said)
-        print(*results[name].notes, sep="\n", flush=True)
-    claims = [claim for result in results.values() for claim in result.claims]
+            sys.stderr.write(said + f"    {one.why}\n" * bool(one.why))
+        print(*result.notes, sep="\n", flush=True)
+        claims += result.claims
     print(verdicts(claims))
-    sys.stderr.write(f"written to {args.out / SUMMARY}\n")
 
 
 def _track(name: str, items: Iterable[T], total: int) -> Iterator[T]:

@@ -16,7 +16,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from benchmarks.experiments import methods as m
 from benchmarks.experiments.methods import Method
-from benchmarks.experiments.sweeps import METRICS, POSE, Curves
+from benchmarks.experiments.sweeps import POSE, Curves
 from rs_localizer.tools.errors import BLUE, ORANGE
 
 _LOOKS: Mapping[str, tuple[str, str, bool]] = {  # color, marker and line, whether it is filled
@@ -28,14 +28,14 @@ _LOOKS: Mapping[str, tuple[str, str, bool]] = {  # color, marker and line, wheth
     m.JOINT.name: ("#8a6d1d", "*-.", False),
     m.REFINED.name: (BLUE, ".-", True),
 }
+_LABELS = ("orientation error (deg)", "position error / distance")
 
 
 def error_figure(curves: Curves, methods: Sequence[Method], x_label: str) -> Figure:
     """The medians of the pose errors, one panel per metric; no display is needed."""
     drawn = Figure(figsize=(9.6, 5.2), dpi=110, layout="constrained")
     panels = drawn.subplots(1, 2, squeeze=False).ravel()
-    labels = list(METRICS.values())
-    for axes, metric in zip(panels, POSE, strict=True):
+    for axes, metric, label in zip(panels, POSE, _LABELS, strict=True):
         for method in methods:
             color, style, filled = _LOOKS[method.name]
             y = curves.medians(method)[:, metric]
@@ -45,7 +45,7 @@ def error_figure(curves: Curves, methods: Sequence[Method], x_label: str) -> Fig
                 markerfacecolor=color if filled else "none", label=method.label,
             )  # fmt: skip
         axes.set_xlabel(x_label)
-        axes.set_ylabel(labels[metric])
+        axes.set_ylabel(label)
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(visible=True, color="#e4e4e4", linewidth=0.6)
         axes.set_yscale("log")

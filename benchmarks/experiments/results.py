@@ -14,7 +14,6 @@ from typing import Protocol, TypeVar
 from matplotlib.figure import Figure
 
 T = TypeVar("T")
-SUMMARY = "summary.md"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,14 +73,11 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """All that an experiment found; the keys of tables and figures become file names."""
+    """All that an experiment found."""
 
-    title: str
-    setting: str  # a paragraph: what was done
     claims: Sequence[Claim]
-    tables: Mapping[str, Table]
-    figures: Mapping[str, Figure] = field(default_factory=dict)
-    notes: Sequence[str] = ()  # further paragraphs
+    notes: Sequence[str]  # tables for people
+    figures: Mapping[str, Figure] = field(default_factory=dict)  # by the names of their files
 
 
 class Track(Protocol):
@@ -101,37 +97,6 @@ class Context:
     trials: int
     seed: int
     track: Track
-
-
-def write_result(folder: Path, result: Result) -> None:
-    """Tables and figures of one experiment."""
-    for name, table in result.tables.items():
-        table.write(folder / f"{name}.csv")
-    for name, figure in result.figures.items():
-        figure.suptitle(result.title)
-        figure.savefig(folder / f"{name}.png")
-
-
-def write_summary(folder: Path, results: Mapping[str, Result], context: Context) -> None:
-    """Every claim with our figure and its verdict."""
-    claims = [claim for result in results.values() for claim in result.claims]
-    lines = [
-        f"# Experiments\n\n{context.trials} trials, seed {context.seed}; **{verdicts(claims)}**.",
-        "The paper: Kukelova and others, *Linear solution to the minimal absolute pose ...*, 2018.",
-    ]
-    for name, result in results.items():
-        lines += [f"## {result.title}\n\n`python -m benchmarks {name}`", result.setting]
-        rows = ["| claim | holds if | our figure | verdict |\n|---|---|---|---|"]
-        rows += [
-            f"| {one.statement} | {one.criterion} | {one.finding} | {one.verdict} |"
-            for one in result.claims
-        ]
-        lines.append("\n".join(rows))
-        lines += [f"Why not *{one.statement}*: {one.why}." for one in result.claims if one.why]
-        lines += [f"```\n{note}\n```" if "\n" in note else note for note in result.notes]
-        lines += [f"![{figure}]({figure}.png)" for figure in result.figures]
-        lines.append("Data: " + ", ".join(f"[{x}.csv]({x}.csv)" for x in result.tables))
-    (folder / SUMMARY).write_text("\n\n".join(lines) + "\n", encoding="utf-8")
 
 
 def verdicts(claims: Sequence[Claim]) -> str:

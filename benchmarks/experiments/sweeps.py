@@ -14,21 +14,15 @@ from benchmarks.experiments.results import Context, Table, rounded
 from benchmarks.experiments.trials import Motions, Setting, Trials, angles, draw_trials
 from rs_localizer.core.arrays import Array
 
-METRICS = {
-    "orientation_deg": "orientation error (deg)",
-    "position": "position error / distance",
-    "w_deg": "error of w (deg per frame)",
-    "t": "error of t (per frame)",
-}
-"""The errors of the paper's figures, and their labels."""
 ORIENTATION, POSITION, W, T = range(4)
+"""The errors of the paper's figures: deg, share of the distance, deg and units per frame."""
 POSE = [ORIENTATION, POSITION]
 
 Initial = Callable[[Trials, float], Array]
 
 
 def motion_errors(found: Motions, truth: Motions) -> Array:
-    """Errors (h,4) in the order of METRICS; infinite where nothing was found.
+    """Errors (h,4) of orientation, position, w and t; infinite where nothing was found.
 
     The position's is relative to the camera's distance from the centre of the points.
     """
@@ -75,16 +69,6 @@ class Curves:
             for name, values in self.quartiles.items()
         ]
         return Table(columns, rows).text()
-
-    def table(self) -> Table:
-        columns = (self.x_name, "method", "metric", "p25", "median", "p75")
-        rows: list[tuple[str | float, ...]] = [
-            (float(x), name, metric, *map(float, values[i, :, k]))
-            for name, values in self.quartiles.items()
-            for i, x in enumerate(self.x)
-            for k, metric in enumerate(METRICS)
-        ]
-        return Table(columns, rows)
 
 
 def sweep(

@@ -21,7 +21,7 @@ _REST = (
 
 
 def run(context: Context) -> Result:
-    """The experiment."""
+    """Translation up to 0.3 per frame, 1 px of noise; everything else as under ``motion``."""
     curves = sweep(
         context, "per_frame", _SPEEDS, lambda speed: Setting(linear=speed, noise=1.0), m.ALL
     )
@@ -36,9 +36,6 @@ def run(context: Context) -> Result:
         curves.x, curves.medians(m.P3P)[:, ORIENTATION], curves.medians(m.VCT_W)[:, ORIENTATION]
     )
     return Result(
-        "Pure translation",
-        "Translation up to 0.3 per frame without rotation, 1 px noise; everything else as under "
-        "Motion.",
         [
             limited(
                 "translation.vct_ahead",
@@ -48,6 +45,5 @@ def run(context: Context) -> Result:
             ),
             joint_is_best("translation", curves),
         ],
-        {"translation": curves.table()},
-        notes=[curves.orientations("per frame", 0.0, 0.15, 0.3), _REST.format(passes)],
+        [curves.orientations("per frame", 0.0, 0.15, 0.3), _REST.format(passes)],
     )  # fmt: skip
