@@ -14,9 +14,8 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: one core, as in a node
 
 import argparse
-import csv
-import math
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -26,18 +25,10 @@ import yaml
 
 from benchmarks.experiments.results import Table
 from benchmarks.frames import paired
-from benchmarks.frames.compared import compare, read, totals, write
+from benchmarks.frames.compared import compare, totals, totals_line, write
 from benchmarks.frames.conditions import BENCHES, Condition, conditions
 from benchmarks.frames.judged import Judged, judge
 from benchmarks.frames.timed import gate, times
-
-_SHOWN = {
-    "frames": "frames", "localized": "loc", "pose@stamp": "pose@s", "pose@mid": "pose@m",
-    "twist@mid": "twist@m", "over_5_sigma": ">5s", "deg_50": "deg", "deg_95": "deg95",
-    "mm_50": "mm", "deg/s_50": "deg/s", "m/s_50": "m/s", "sharp_turn_s": "shp_t@s",
-    "sharp_turn": "shp_turn", "sharp_way": "shp_way", "sharp_angular": "shp_w",
-    "sharp_linear": "shp_v", "ms": "ms", "ms_95": "ms95",
-}  # fmt: skip
 
 _TOGETHER = {
     "localized": "found", "pose@m": "poses", "twist@m": "twists", ">5s": "beyond_5",
@@ -56,8 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.frames", description=__doc__)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     run = commands.add_parser("run", help="judge the version that Python finds")
-    run.add_argument("--out", type=Path, required=True, metavar="FILE.csv",
-                     help="table; every frame goes to FILE.npz")  # fmt: skip
+    run.add_argument("--out", type=Path, required=True, metavar="FILE.npz", help="every frame")
     run.add_argument("--bench", nargs="+", choices=tuple(BENCHES), metavar="NAME",
                      default=tuple(BENCHES), help=", ".join(BENCHES))  # fmt: skip
     run.add_argument("--only", nargs="+", default=(), metavar="WORD",
@@ -68,9 +58,9 @@ def _parser() -> argparse.ArgumentParser:
                      help="settings of the localizer, velocity_prior.angular:=0.5")  # fmt: skip
     run.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (1)")
     run.set_defaults(command=_run)
-    against = commands.add_parser("compare", help="two tables, condition by condition")
-    against.add_argument("before", type=Path, metavar="BEFORE.csv")
-    against.add_argument("after", type=Path, metavar="AFTER.csv")
+    against = commands.add_parser("compare", help="two runs, condition by condition")
+    against.add_argument("before", type=Path, metavar="BEFORE.npz")
+    against.add_argument("after", type=Path, metavar="AFTER.npz")
     against.add_argument("--all", action="store_true", help="also conditions that hardly differ")
     against.set_defaults(command=compare)
     paired.add_to(commands.add_parser("paired", help="some 1,500 frames, beside another version"))
@@ -96,31 +86,25 @@ def _run(options: argparse.Namespace) -> int:
     each = [(one, options.frames, options.seed, settings) for one in wanted]
     judged: dict[str, Judged] = {}
     width = max(len(one.name) for one in wanted)
-    with options.out.open("w", newline="", encoding="utf-8") as file:
-        table: Any = None
-        pool = ProcessPoolExecutor(options.jobs) if options.jobs > 1 else None
-        found = (pool.map if pool else map)(_judge, each)
-        for condition, one in zip(wanted, found, strict=True):
-            row = one.row(condition)
-            if table is None:
-                table = csv.DictWriter(file, list(row))
-                table.writeheader()
-            if not judged or wanted[len(judged) - 1].bench != condition.bench:
-                heads = " ".join(f"{name:>8}" for name in _SHOWN.values())
-                sys.stderr.write(f"{condition.bench:{width}} {heads}\n")
-                if judged:  # who stops the run keeps the benches that are done
-                    write(options.out, judged)
-            judged[f"{condition.bench}/{condition.name}"] = one
-            table.writerow(row)
-            file.flush()
-            cells = " ".join(f"{_short(row[name]):>8}" for name in _SHOWN)
-            sys.stderr.write(f"{condition.name:{width}} {cells}  {row['reasons']}\n")
-        if pool:
-            pool.shutdown()
+    pool = ProcessPoolExecutor(options.jobs) if options.jobs > 1 else None
+    found = (pool.map if pool else map)(_judge, each)
+    for condition, one in zip(wanted, found, strict=True):
+        if not judged or wanted[len(judged) - 1].bench != condition.bench:
+            sys.stderr.write(f"{totals_line(condition.bench, None, width)}\n")
+            if judged:  # who stops the run keeps the benches that are done
+                write(options.out, judged)
+        name = f"{condition.bench}/{condition.name}"
+        judged[name] = one
+        reasons = Counter(filter(None, one.reasons)).most_common()
+        said = ", ".join(f"{count} {reason}" for reason, count in reasons)
+        row = totals({name: one})["all"]
+        sys.stderr.write(f"{totals_line(condition.name, row, width)}  {said}\n")
+    if pool:
+        pool.shutdown()
     write(options.out, judged)
     rows = [
         (bench, *(f"{total[name]:.3g}" for name in _TOGETHER))
-        for bench, total in totals(read(options.out)).items()
+        for bench, total in totals(judged).items()
     ]
     sys.stdout.write(f"{Table(('', *_TOGETHER.values()), rows).text()}\n")
     return 0
@@ -140,12 +124,6 @@ def _setting(text: str) -> tuple[str, Any]:
     if not assigned:
         raise ValueError(f"settings are NAME:=VALUE, got {text!r}")
     return name, yaml.safe_load(value)
-
-
-def _short(value: str | float | int) -> str:
-    if isinstance(value, float):
-        return "-" if math.isnan(value) else f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
-    return str(value)
 
 
 if __name__ == "__main__":

@@ -202,12 +202,12 @@ def totals(judged: Mapping[str, Judged]) -> dict[str, dict[str, float]]:
     return found
 
 
-def totals_line(label: str, row: Mapping[str, float] | None) -> str:
+def totals_line(label: str, row: Mapping[str, float] | None, width: int = 12) -> str:
     """One line of the table; without a row: the names of the columns."""
     sharp = (f"s_{name}" for name in _SHARP)
     names = ("localized", *_SHARES[1:-1], ">5s", *_ERRORS, *sharp, "ms", "ms_95")
     cells = (f"{name if row is None else f'{row[name]:.3g}':>10}" for name in names)
-    return f"{label:12}{''.join(cells)}"
+    return f"{label:{width}}{''.join(cells)}"
 
 
 def changes_together(

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
@@ -28,8 +27,6 @@ FIVE_SIGMA = float(chi2.isf(2.0 * norm.sf(5.0), 6))
 _MEDIAN = float(chi2.median(3))
 # The errors of a calibration point there, by turns.
 _DIRECTIONS = np.array([(0.6, 0.8), (-0.8, 0.6), (-0.6, -0.8), (0.8, -0.6)])
-
-Row = dict[str, str | float | int]
 
 FIGURES = (
     "recording", "ms",
@@ -59,45 +56,6 @@ class Judged:
         """Of the localized frames (k,), which truths lie in a 95 % region: pose_s, pose, twist."""
         held: NDArray[np.bool_] = self.of(name)[self.localized] < REGION
         return held
-
-    def row(self, condition: Condition) -> Row:
-        """A line of the table; shares in %, of the frames with a pose."""
-        some = self.localized
-
-        def share(hits: NDArray[np.bool_]) -> float:
-            return 100.0 * float(np.mean(hits)) if len(hits) else math.nan
-
-        twists = np.isfinite(self.of("deg/s")[some]).any()
-        return {
-            "bench": condition.bench,
-            "condition": condition.name,
-            "frames": len(some),
-            "localized": 100.0 * float(np.mean(some)),
-            "pose@stamp": share(self.inside("pose_s")),
-            "pose@mid": share(self.inside("pose")),
-            "twist@mid": share(self.inside("twist")) if twists else math.nan,
-            "inside_or_refused": 100.0 * float(np.mean((self.of("pose") < REGION) | ~some)),
-            "over_5_sigma": share(far_off(self)[some]),
-            **{
-                f"{name}_50": quantile(self.of(name), 0.5)
-                for name in ("deg_s", "deg", "mm", "deg/s", "m/s")
-            },
-            **{
-                f"{name}_95": quantile(self.of(name), 0.95)
-                for name in ("deg", "mm", "deg/s", "m/s")
-            },
-            **{
-                f"sharp_{name}": sharpness(self.of(name))
-                for name in ("turn_s", "turn", "way", "angular", "linear")
-            },
-            # What is compiled on the way, is in a few frames.
-            "ms": quantile(self.of("ms"), 0.5),
-            "ms_95": quantile(self.of("ms"), 0.95),
-            "reasons": ", ".join(
-                f"{count} {reason}"
-                for reason, count in Counter(filter(None, self.reasons)).most_common()
-            ),
-        }
 
 
 def quantile(values: Array, q: float) -> float:

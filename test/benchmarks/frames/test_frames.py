@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.frames import __main__ as command
-from benchmarks.frames.compared import changes_of, read
-from benchmarks.frames.conditions import HAND, NARROW, Condition, Points, turning
+from benchmarks.frames.compared import changes_of, read, totals
+from benchmarks.frames.conditions import NARROW, Condition, Points, turning
 from benchmarks.frames.generated import generate
 from benchmarks.frames.judged import (
     FIGURES,
@@ -21,10 +21,8 @@ from benchmarks.frames.judged import (
     of_twist,
 )
 from benchmarks.independent.rotations import logarithm
-from benchmarks.independent.scenes import Rich, SmallPlane
+from benchmarks.independent.scenes import SmallPlane
 from rs_localizer.io.outputs import BodyPose, Twist
-
-CONDITION = Condition("hand", "some", HAND, Rich(40), 1.0)
 
 
 def judged(count: int, wider: float = 1.0, farther: float = 1.0, seed: int = 0) -> Judged:
@@ -74,13 +72,15 @@ def test_errors_are_weighed_by_the_covariances_that_are_published(wider, least, 
 
 
 def test_honest_regions_hold_and_are_sharp():
-    row = judged(4000).row(CONDITION)
-    for share in ("pose@stamp", "pose@mid", "twist@mid"):
-        assert row[share] == pytest.approx(95.0, abs=1.2)
-    assert row["over_5_sigma"] == 0.0
-    assert row["sharp_turn"] == pytest.approx(1.0, abs=0.03)
-    assert judged(4000, wider=4.0).row(CONDITION)["sharp_way"] == pytest.approx(2.0, abs=0.06)
-    assert judged(4000, wider=0.1).row(CONDITION)["over_5_sigma"] > 10.0
+    def row(**off: float) -> dict[str, float]:
+        return totals({"hand/some": judged(4000, **off)})["all"]
+
+    for share in ("pose@s", "pose@m", "twist@m"):
+        assert row()[share] == pytest.approx(95.0, abs=1.2)
+    assert row()[">5s"] == 0.0
+    assert row()["s_turn"] == pytest.approx(1.0, abs=0.03)
+    assert row(wider=4.0)["s_way"] == pytest.approx(2.0, abs=0.06)
+    assert row(wider=0.1)[">5s"] > 10.0
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_the_gyroscope_says_how_the_camera_turns():
 
 
 def test_the_commands(tmp_path, capsys):
-    table = tmp_path / "a.csv"
+    table = tmp_path / "a.npz"
     words = ["--bench", "real", "--only", "slow", "tracked", "1px", "--frames", "2"]
     assert command.main(["run", "--out", str(table), *words]) == 0
     out, said = capsys.readouterr()
