@@ -8,18 +8,6 @@ import numpy as np
 from rs_localizer.tools import errors
 
 
-def test_associate_takes_the_nearest_within_the_tolerance(monkeypatch):
-    true = np.array([10, 20, 30, 40], np.int64)
-    estimated = np.array([0, 8, 16, 25, 30, 33, 47], np.int64)
-    monkeypatch.setattr(errors, "TOLERANCE_NS", 5)
-    rows, true_rows = errors.associate(estimated, true)
-    assert rows.tolist() == [1, 2, 3, 4, 5]
-    assert true_rows.tolist() == [0, 1, 1, 2, 2]
-    monkeypatch.setattr(errors, "TOLERANCE_NS", 0)
-    rows, true_rows = errors.associate(estimated, true)
-    assert (rows.tolist(), true_rows.tolist()) == ([4], [2])
-
-
 def test_picture_has_a_colored_curve_for_each_method(tmp_path):
     values = np.full(400, 0.01)
     values[77] = 30.0

@@ -73,22 +73,25 @@ def test_keypoints(of, direction, distortion):
     are_derivatives(lambda one: problem.keypoint_rows(one, 100.0)[0], problem, state)
 
 
-@pytest.mark.parametrize("fading", [0.0, 0.1])
-def test_accelerations(fading):
-    problem, state = small()
-    expected = Freedom(angular_acceleration=3.0, linear_acceleration=2.0, fading=fading)
-    are_derivatives(lambda one: acceleration_rows(one.spline, expected), problem, state)
+ACCELERATIONS = Freedom(angular_acceleration=3.0, linear_acceleration=2.0)
+FADING = replace(ACCELERATIONS, fading=0.1)
 
 
-def test_velocities_of_images_that_stand_alone():
-    problem, state = small(controls=0.04)
-    are_derivatives(lambda one: rest_rows(one.spline, 2.0, 1.0), problem, state)
-
-
-def test_where_the_whole_is():
-    problem, state = small()
-    floating = Floating(state.spline)
-    are_derivatives(lambda one: floating.rows(one.spline), problem, state)
+@pytest.mark.parametrize(
+    ("rows", "controls"),
+    [
+        (lambda problem, start, one: acceleration_rows(one.spline, ACCELERATIONS), 0.4),
+        (lambda problem, start, one: acceleration_rows(one.spline, FADING), 0.4),
+        (lambda problem, start, one: rest_rows(one.spline, 2.0, 1.0), 0.04),  # images alone
+        (lambda problem, start, one: Floating(start.spline).rows(one.spline), 0.4),
+        (lambda problem, start, one: block_rows(
+            one.delays[:, None], np.full(5, 0.5), problem.at[0]["delays"]), 0.4),
+    ],
+    ids=["accelerations", "fading", "rest", "the whole", "blocks"],
+)  # fmt: skip
+def test_what_is_expected_of_the_motion(rows, controls):
+    problem, state = small(controls=controls)
+    are_derivatives(lambda one: rows(problem, state, one), problem, state)
 
 
 def test_a_gyroscope():
@@ -124,14 +127,6 @@ def test_what_is_known_beforehand(of, count):
             step[column] = 1e-6
             costs = [priors(problem.moved(off, s * step))[k].cost for s in (1, -1)]
             assert (costs[0] - costs[1]) / 4e-6 == pytest.approx(slope, rel=1e-3, abs=1e-3)
-
-
-def test_what_is_known_of_blocks():
-    """Of the times of images, each by itself."""
-    problem, state = small()
-    first = problem.at[0]["delays"]
-    are_derivatives(lambda one: block_rows(one.delays[:, None], np.full(5, 0.5), first), problem,
-                    state)  # fmt: skip
 
 
 @pytest.mark.parametrize("of", ["board", "paper", "faded", "bodies"])

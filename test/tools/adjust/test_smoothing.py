@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Smoothing: better than tracking, honest, and silent where the images say nothing."""
 
-from dataclasses import replace
-
 import numpy as np
 import projector
 import pytest
@@ -86,39 +84,6 @@ def test_smoothed_motion_is_better_than_tracked_and_its_covariance_holds(turn):
                             found[:, at])  # fmt: skip
         assert np.mean(squared < 12.59) > 0.9
         assert 2.0 < squared.mean() < 8.0
-
-
-def test_frames_that_shake_faster_than_the_motion_are_said_to():
-    """60 Hz, which a gyroscope knows: a spline averages it away and would be sure of it."""
-    rng = np.random.default_rng(14)
-    calm = projector.Motion.random(rng)
-    tone = np.zeros((6, 1))
-    tone[:3] = np.radians(0.3)
-    shaking = projector.Motion(
-        np.hstack([calm.amplitudes, tone]),
-        np.hstack([calm.frequencies, np.full((6, 1), 2.0 * np.pi * 61.0)]),
-        np.hstack([calm.phases, np.arange(6.0)[:, None]]),
-    )
-    scene = projector.room(rng, 1500)
-    for motion, share in ((calm, 0.0), (shaking, 1.0)):
-        recorded = projector.record(rng, motion, scene, readout=READOUT, seconds=1.2)
-        images = [ImagePoints(round(1e9 * f.stamp), f.points, f.pixels) for f in recorded]
-        poses = zip(*motion.pose([f.stamp + 0.5 * READOUT for f in recorded]), strict=True)
-        one = Localizer(CAMERA).localize(recorded[0].points, recorded[0].pixels)
-        # As with the gyroscope's turn: the poses are right, and the noise is all that is left.
-        estimates = [
-            replace(
-                one, rotation=rotation.T, translation=-rotation.T @ position,
-                inliers=np.ones(len(image.points), np.bool_),
-                residuals=np.full(len(image.points), 0.3 * np.sqrt(2.0)),
-            )
-            for image, (rotation, position) in zip(images, poses, strict=True)
-        ]  # fmt: skip
-        found = run([(0.0, *of) for of in zip(images, estimates, strict=True)])
-        assert np.mean(found.shaken) == share
-        if share:
-            stamps = np.array([image.stamp_ns for image in images])
-            assert not np.any(found.sample(stamps + round(0.5e9 * READOUT)).determined)
 
 
 def test_gaps_are_bridged_only_where_the_neighbours_determine_them():

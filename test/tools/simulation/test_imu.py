@@ -13,21 +13,14 @@ from rs_localizer.tools.simulation.simulated_imu import (
     ImuSettings,
     Lever,
     Shaken,
-    shaken,
     simulate_imu,
 )
-from rs_localizer.tools.simulation.true_motion import ConstantVelocity, RecordedMotion
+from rs_localizer.tools.simulation.true_motion import RecordedMotion
 
 PERFECT = ImuSettings(2000.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 CAMERA_FROM_IMU = Rotation.from_euler("xyz", [20.0, -70.0, 140.0], degrees=True).as_matrix()
 LEVER = Lever(CAMERA_FROM_IMU, np.array([0.1, -0.05, 0.02]))
 RNG = np.random.default_rng(0)
-
-
-def steady(duration: float) -> ConstantVelocity:
-    return ConstantVelocity(
-        np.array([0.3, -1.0, 0.7]), np.array([0.4, 0.1, -0.2]), duration, start_ns=10**18
-    )
 
 
 def test_the_motion_comes_back_when_it_is_integrated():
@@ -56,18 +49,3 @@ def test_the_motion_comes_back_when_it_is_integrated():
     there = end.positions[0] + end.rotations[0] @ LEVER.position
     assert np.linalg.norm(place - there) < 1e-3
     assert np.linalg.norm(there - start.positions[0]) > 0.1  # it has been somewhere
-
-
-def test_a_shaken_camera_turns_as_its_poses_do():
-    motion = shaken(steady(2.0), [(0.3, 60.0), (0.1, 120.0)], np.random.default_rng(2))
-    at, h = np.linspace(0.1, 1.9, 50), 1e-6
-    now = motion.state(10**18, at)
-    before, after = (motion.state(10**18, at + shift) for shift in (-h, h))
-    turned = Rotation.from_matrix(np.swapaxes(before.rotations, 1, 2) @ after.rotations)
-    np.testing.assert_allclose(turned.as_rotvec() / (2.0 * h), now.angular, atol=1e-5)
-    moved = (after.positions - before.positions) / (2.0 * h)
-    np.testing.assert_allclose(np.einsum("nji,nj->ni", now.rotations, moved), now.linear, atol=1e-6)
-    still = steady(2.0).state(10**18, np.linspace(0.0, 2.0, 4000))
-    swung = motion.state(10**18, np.linspace(0.0, 2.0, 4000))
-    angles = Rotation.from_matrix(np.swapaxes(still.rotations, 1, 2) @ swung.rotations).magnitude()
-    assert math.radians(0.3) < angles.max() <= math.radians(0.4001)

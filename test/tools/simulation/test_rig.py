@@ -20,21 +20,6 @@ TURN = Rotation.from_euler("xyz", [0.1, -0.2, np.pi]).as_matrix()
 PLACE = np.array([0.1, -0.2, 0.05])
 
 
-def test_a_mounted_camera_is_carried_along_by_the_turn_of_the_rig():
-    rig = ConstantVelocity(np.array([0.5, -1.0, 0.7]), np.array([0.3, 0.1, -0.2]), 1.0)
-    mounted = MountedMotion(rig, TURN, PLACE)
-    step, point = 1e-6, np.array([1.0, 2.0, 3.0])
-    before, now, after = (mounted.state(0, np.array([0.4 + k * step])) for k in (-1, 0, 1))
-    velocity = (after.positions[0] - before.positions[0]) / (2.0 * step)
-    np.testing.assert_allclose(now.rotations[0] @ now.linear[0], velocity, atol=1e-8)
-    turned = Rotation.from_matrix(before.rotations[0].T @ after.rotations[0]).as_rotvec()
-    np.testing.assert_allclose(now.angular[0], turned / (2.0 * step), atol=1e-8)
-    state = rig.state(0, np.array([0.4]))
-    in_rig = state.rotations[0].T @ (point - state.positions[0])
-    in_camera = now.rotations[0].T @ (point - now.positions[0])
-    np.testing.assert_allclose(in_camera, TURN @ in_rig + PLACE, atol=1e-12)
-
-
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("rig")

@@ -8,6 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.trajectories import Trajectory
+from rs_localizer.tools.simulation.simulated_imu import shaken
+from rs_localizer.tools.simulation.simulated_rig import MountedMotion
 from rs_localizer.tools.simulation.simulated_settings import BODY_FROM_CAMERA
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity, RecordedMotion, TrueMotion
 
@@ -28,10 +30,15 @@ def recording(t: Array) -> Trajectory:
     return Trajectory(START_NS + np.round(t * 1e9).astype(np.int64), positions, quaternions)
 
 
+STEADY = ConstantVelocity(
+    np.array([0.5, -1.5, 2.0]), np.array([1.0, -0.5, 0.25]), 4.0, start_ns=START_NS
+)
+TURN = Rotation.from_euler("xyz", [0.1, -0.2, np.pi]).as_matrix()
+PLACE = np.array([0.1, -0.2, 0.05])
 MOTIONS = {
-    "constant": ConstantVelocity(
-        np.array([0.5, -1.5, 2.0]), np.array([1.0, -0.5, 0.25]), 4.0, start_ns=START_NS
-    ),
+    "constant": STEADY,
+    "shaken": shaken(STEADY, [(0.3, 60.0), (0.1, 120.0)], np.random.default_rng(2)),
+    "mounted": MountedMotion(STEADY, TURN, PLACE),
     "smoothed": RecordedMotion(recording(np.arange(0.0, 4.0, 1 / 120))),
     "interpolated": RecordedMotion(recording(np.arange(0.0, 4.0, 1 / 120)), knot_spacing=0.0),
     "optical": RecordedMotion(recording(np.arange(0.0, 4.0, 1 / 120)), axes="optical"),
@@ -48,8 +55,9 @@ def test_velocities_are_the_derivatives_of_the_poses(name):
         here = state.rotations[1]
         velocity = (state.positions[2] - state.positions[0]) / (2.0 * step)
         turn = Rotation.from_matrix(state.rotations[0].T @ state.rotations[2])
-        np.testing.assert_allclose(state.linear[1], here.T @ velocity, atol=1e-7)
-        np.testing.assert_allclose(state.angular[1], turn.as_rotvec() / (2.0 * step), atol=1e-7)
+        within = 1e-4 if name == "shaken" else 1e-7
+        np.testing.assert_allclose(state.linear[1], here.T @ velocity, atol=within)
+        np.testing.assert_allclose(state.angular[1], turn.as_rotvec() / (2.0 * step), atol=within)
 
 
 @pytest.mark.parametrize(("name", "tolerance"), [("smoothed", 1e-3), ("interpolated", 1e-6)])
@@ -62,31 +70,21 @@ def test_spline_follows_the_recording(name, tolerance):
     np.testing.assert_allclose(state.rotations, expected, atol=tolerance)
 
 
-def test_knots_average_the_noise_of_the_recording():
-    t = np.arange(0.0, 4.0, 1 / 120)
-    clean, rng = recording(t), np.random.default_rng(3)
-    noisy = Trajectory(
-        clean.stamps_ns, clean.positions + rng.normal(0.0, 0.01, (len(t), 3)), clean.quaternions
+def test_a_shaken_camera_turns_as_far_as_its_tones():
+    times = np.linspace(0.0, 2.0, 4000)
+    still, swung = (
+        MOTIONS[name].state(START_NS, times).rotations for name in ("constant", "shaken")
     )
-    between = t[10:-10] + 1 / 240
-    truth = recorded_way(between)[0]
-
-    def speed_error(knot_spacing: float) -> float:
-        motion = RecordedMotion(noisy, "optical", knot_spacing)
-        true_motion = RecordedMotion(clean, "optical", 0.0)
-        state, true_state = motion.state(START_NS, between), true_motion.state(START_NS, between)
-        assert np.abs(state.positions - truth).max() < 0.05
-        return float(np.std(state.linear - true_state.linear))
-
-    assert speed_error(0.05) < 0.2 * speed_error(0.0)
+    angles = Rotation.from_matrix(np.swapaxes(still, 1, 2) @ swung).magnitude()
+    assert np.radians(0.3) < angles.max() <= np.radians(0.4001)
 
 
-def test_gaps_split_the_motion():
-    t = np.arange(0.0, 4.0, 1 / 120)
-    t = t[(t < 1.0) | (t > 1.4)]
-    t = np.delete(t, [200])  # one lost sample is no gap
-    motion = RecordedMotion(recording(t))
-    seconds = (np.array(motion.intervals_ns) - START_NS) * 1e-9
-    np.testing.assert_allclose(seconds, [[0.0, 0.9917], [1.4083, 3.9917]], atol=1e-4)
-    after = motion.state(START_NS + 1_500_000_000, np.zeros(1))
-    np.testing.assert_allclose(after.positions[0], recorded_way(np.array([1.5]))[0][0], atol=1e-3)
+def test_a_mounted_camera_sees_points_where_its_rig_carries_it():
+    point = np.array([1.0, 2.0, 3.0])
+    rig, camera = (
+        MOTIONS[name].state(START_NS, np.array([0.4])) for name in ("constant", "mounted")
+    )
+    in_rig, in_camera = (
+        state.rotations[0].T @ (point - state.positions[0]) for state in (rig, camera)
+    )
+    np.testing.assert_allclose(in_camera, TURN @ in_rig + PLACE, atol=1e-12)
