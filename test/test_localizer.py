@@ -16,6 +16,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
+from benchmarks.independent.cameras import Camera, Scan
 from rs_localizer.config import NodeConfig
 from rs_localizer.solvers.table import SOLVERS
 

@@ -12,8 +12,6 @@ from rs_localizer.io.bags import open_bag
 from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.rigs import RigParts, mounted_lenses, node_parameters
 from rs_localizer.settings import write_camera_file
-from rs_localizer.tools.simulation.simulated_rig import MountedMotion
-from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
 K = np.array([[450.0, 0.0, 320.0], [0.0, 450.0, 240.0], [0.0, 0.0, 1.0]])
 TURN = Rotation.from_euler("xyz", [0.1, -0.2, np.pi]).as_matrix()
