@@ -37,7 +37,7 @@ if WORKING:
     from rs_localizer.localizer import Localizer
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.markers.maps import MarkerMap
-    from rs_localizer.offline.detect import seen_by
+    from rs_localizer.offline.detect import ImageTally, usable
     from rs_localizer.offline.fleet import Figures
     from rs_localizer.offline.image_sources import Carried, Shot
     from rs_localizer.offline.recordings import optical_frame, read_imu_recording, read_recording
@@ -212,18 +212,18 @@ def _warn(*faults: str | None) -> None:
 def _detected(args: Options, shots: Iterator[Shot | Carried]) -> _Input:
     marker_map = find_map(args)
     detector = FrameDetector(DetectorConfig(), lambda name, text: None, marker_map)
-    images, frames, refused = list[ImagePoints](), [], dict[str, str]()
+    images, frames, tally = list[ImagePoints](), [], ImageTally()
     camera: Camera | None = None
     size = (0, 0)
-    seen = seen_by(shots, NodeConfig().scan_direction, refused)
-    for image, own in tqdm(seen, unit="image", desc="detect", disable=None):
+    seen = usable(shots, NodeConfig().scan_direction, tally)
+    for _, image, own in tqdm(seen, unit="image", desc="detect", disable=None):
         camera, size = camera or own, image.pixels.shape[::-1]
         found = detector.detect(image).detections
         images.append(ImagePoints(image.stamp_ns, found.points, found.pixels))
         if len(found.points):
             frames.append((found.points, found.pixels, found.ids))
     print(f"{len(frames)} of {len(images)} images show the map")
-    image_input.print_left_out(refused)
+    image_input.print_left_out(tally.refused)
     _warn(detector.mistake)
     find_lens = args.intrinsics or camera is None
     camera = camera or first_lens(size, in_order(images))

@@ -28,7 +28,6 @@ if WORKING:
         INFO_TYPE,
         Carried,
         Shot,
-        find_topic,
         from_bag,
         from_files,
         from_video,
@@ -123,9 +122,10 @@ def opened(args: ImageOptions, calibrated: bool = True) -> Iterator[Source]:
             raise UsageError("--rate is for videos and folders; a bag has its own times")
         topics, info = remapped(args), None
         with open_bag(path) as bag:
-            topic = find_topic(bag, IMAGE_TYPES, topics.get(IMAGE), "-r image:=")
+            topic = bag.find_topic(IMAGE_TYPES, topics.get(IMAGE), "-r image:=TOPIC")
             if camera is None and (calibrated or INFO_TYPE in bag.topics.values()):
-                info = find_topic(bag, (INFO_TYPE,), topics.get(CAMERA_INFO), "-r camera_info:=")
+                option = "-r camera_info:=TOPIC, or give --camera FILE"
+                info = bag.find_topic((INFO_TYPE,), topics.get(CAMERA_INFO), option)
             yield Source(from_bag(bag, topic, info, camera), bag.count([topic]), None)
         return
     if args.remaps:

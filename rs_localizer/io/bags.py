@@ -83,6 +83,39 @@ class BagReader:
         counts = self._reader.topics
         return sum(counts[topic].msgcount for topic in topics if topic in counts)
 
+    def find_topic(
+        self, types: Collection[str], given: str | None, option: str, name: str = ""
+    ) -> str:
+        """Return a topic of one of these types: the given one, or the only one.
+
+        Args:
+            option: that gives one, as ``-r imu:=TOPIC``.
+            name: topics that end in it are preferred.
+
+        Raises:
+            BagError: when it is not there, or several could be meant.
+        """
+        of_type = sorted(topic for topic, kind in self.topics.items() if kind in types)
+        wanted, there = " or ".join(types), ", ".join(of_type) or "none"
+        if given is not None:
+            if given in of_type:
+                return given
+            fault = f"is of type {self.topics[given]}" if given in self.topics else "does not exist"
+            raise BagError(f"{self.path}: {given} {fault}; topics of type {wanted}: {there}")
+        named = [topic for topic in of_type if name and topic.split("/")[-1] == name]
+        for candidates in (named, of_type):
+            if len(candidates) == 1:
+                return candidates[0]
+            if candidates:
+                raise BagError(
+                    f"{self.path} has several topics of type {wanted}: {', '.join(candidates)}; "
+                    f"choose one with {option}"
+                )
+        known = ", ".join(f"{topic} ({kind})" for topic, kind in self.topics.items())
+        raise BagError(
+            f"{self.path} has no topic of type {wanted} for {option}; it has {known or 'none'}"
+        )
+
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
         """Yield topic, time of recording (ns) and message, in the order of that time.
 

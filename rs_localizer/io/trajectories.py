@@ -14,7 +14,7 @@ import gzip
 import io
 import zlib
 from array import array
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.io.bags import BagError, BagReader, is_bag, open_bag
+from rs_localizer.io.bags import BagReader, is_bag, open_bag
 from rs_localizer.io.messages import stamp_ns
 
 # Files round quaternions to four digits or more; what is further from 1 is no rotation.
@@ -236,8 +236,9 @@ def read_motions(
     if path.is_file() and not is_bag(path):
         return Motions(read_tum(path), None)
     with open_bag(path) as bag:
-        pose_topic = _topic(bag, _POSE, pose_topic, "-r pose:=", required=True)
-        twist_topic = _topic(bag, _TWIST, twist_topic, "-r twist:=", required=False)
+        pose_topic = bag.find_topic((_POSE,), pose_topic, "-r pose:=TOPIC")
+        if twist_topic is not None or _TWIST in bag.topics.values():
+            twist_topic = bag.find_topic((_TWIST,), twist_topic, "-r twist:=TOPIC")
         messages = _by_stamp(bag, pose_topic)
         poses = Trajectory(
             np.array(list(messages), np.int64),
@@ -255,25 +256,6 @@ def read_motions(
                 np.array([_xyz(m.twist.linear) for m in messages.values()]),
             ),
         )
-
-
-def _topic(
-    bag: BagReader, type_name: str, chosen: str | None, option: str, *, required: bool
-) -> Any:
-    candidates = sorted(topic for topic, kind in bag.topics.items() if kind == type_name)
-    if chosen is not None:
-        if chosen not in candidates:
-            raise BagError(_sentence(bag, f"no {type_name} on {chosen}", candidates))
-        return chosen
-    if len(candidates) > 1:
-        raise BagError(_sentence(bag, f"several {type_name}; choose with {option}", candidates))
-    if required and not candidates:
-        raise BagError(_sentence(bag, f"no {type_name}", bag.topics))
-    return candidates[0] if candidates else None
-
-
-def _sentence(bag: BagReader, fault: str, topics: Collection[str]) -> str:
-    return f"{bag.path} has {fault}; found {', '.join(sorted(topics)) or 'none'}"
 
 
 def _by_stamp(bag: BagReader, topic: str) -> dict[int, Any]:

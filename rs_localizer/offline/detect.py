@@ -53,23 +53,29 @@ class DetectError(ValueError):
 
 
 @dataclass(slots=True)
-class Extraction:
-    """Counts of used and refused images, and their content."""
+class ImageTally:
+    """Counts of used and refused images."""
 
     images: int = 0
-    counts: list[int] = field(default_factory=list)  # keypoints or corners, where there are any
     refused: dict[str, str] = field(default_factory=dict)  # the first detail of each reason
-    carried: Counter[str] = field(default_factory=Counter)  # messages of other topics
     stamps_ns: list[int] = field(default_factory=list)
-    residual: float = np.nan  # px rms of a global-shutter pose, median; NaN where none was possible
-    faults: tuple[str, ...] = ()  # what speaks against map or calibration
-    notes: tuple[str, ...] = ()  # what the detector says of some images
 
     @property
     def period(self) -> float:
         """s from one image to the next, median; NaN for a single one."""
         steps = np.diff(np.array(self.stamps_ns, np.int64))
         return float(np.median(steps)) * 1e-9 if len(steps) else np.nan
+
+
+@dataclass(slots=True)
+class Extraction(ImageTally):
+    """Content of images."""
+
+    counts: list[int] = field(default_factory=list)  # keypoints or corners, where there are any
+    carried: Counter[str] = field(default_factory=Counter)  # messages of other topics
+    residual: float = np.nan  # px rms of a global-shutter pose, median; NaN where none was possible
+    faults: tuple[str, ...] = ()  # what speaks against map or calibration
+    notes: tuple[str, ...] = ()  # what the detector says of some images
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +108,10 @@ def record_markers(
     """
     found = Extraction()
     tally = _MarkerTally(detector, found)
-    for shot, image, camera in _readable(shots, bag, found, options, done):
+    for shot, image, camera in usable(
+        _kept(shots, bag, found), options.scan_direction, found, done
+    ):
+        assert camera is not None
         detected = detector.detect(image)
         tally.add(camera, detected)
         if len(detected.detections.ids):
@@ -117,31 +126,53 @@ def record_markers(
     return tally.recorded()
 
 
-def _readable(
-    shots: Iterable[Shot | Carried], bag: BagWriter, found: Extraction, options: DetectionOptions,
-    done: Callable[[], object],
-) -> Iterator[tuple[Shot, Image, Camera]]:  # fmt: skip
-    """Yield usable images with their cameras, and write what else is to be kept.
-
-    Raises:
-        DetectError: when they and their calibration differ in size.
-    """
-    cameras = Cameras(options.scan_direction)
+def _kept(shots: Iterable[Shot | Carried], bag: BagWriter, found: Extraction) -> Iterator[Shot]:
+    """Yield the images, and write what else is to be kept."""
     for shot in shots:
         if isinstance(shot, Carried):
             found.carried[shot.topic] += 1
             bag.write(shot.topic, shot.message, shot.recorded_ns)
-            continue
-        found.images += 1
-        if isinstance(shot.image, Refusal):
-            found.refused.setdefault(shot.image.reason, shot.image.detail)
         else:
-            found.stamps_ns.append(shot.image.stamp_ns)
-            camera = cameras.camera_of(shot, shot.image)
-            if isinstance(camera, Refusal):
-                found.refused.setdefault(camera.reason, camera.detail)
-            else:
-                yield shot, shot.image, camera
+            yield shot
+
+
+def usable(
+    shots: Iterable[Shot | Carried], scan_direction: str, tally: ImageTally,
+    done: Callable[[], object] = lambda: None,
+) -> Iterator[tuple[Shot, Image, Camera | None]]:  # fmt: skip
+    """Yield the usable images, each with its camera, without a readout time, if it is known.
+
+    Args:
+        tally: of all images.
+        done: called after each of them.
+
+    Raises:
+        DetectError: when they and their calibration differ in size, or, without one, they are of
+            several sizes.
+    """
+    cameras, size = Cameras(scan_direction), None
+    for shot in shots:
+        if isinstance(shot, Carried):
+            continue
+        tally.images += 1
+        image, camera = shot.image, None
+        if not isinstance(image, Refusal):
+            tally.stamps_ns.append(image.stamp_ns)
+            camera = None if shot.camera_info is None else cameras.camera_of(shot, image)
+        if isinstance(image, Refusal) or isinstance(camera, Refusal):
+            refusal = image if isinstance(image, Refusal) else camera
+            assert isinstance(refusal, Refusal)
+            tally.refused.setdefault(refusal.reason, refusal.detail)
+        else:
+            size = size or image.pixels.shape
+            if camera is None and image.pixels.shape != size:
+                (height, width), (other, across) = size, image.pixels.shape
+                raise DetectError(
+                    f"the image at {1e-9 * image.stamp_ns:.3f} s is of {across}x{other}, those "
+                    f"before it are of {width}x{height}: a lens is calibrated with images of one "
+                    "size"
+                )
+            yield shot, image, camera
         done()
     cameras.check()
 
@@ -262,41 +293,6 @@ class Cameras:
             raise DetectError(self._fault)
 
 
-def seen_by(
-    shots: Iterable[Shot | Carried], scan_direction: str, refused: dict[str, str]
-) -> Iterator[tuple[Image, Camera | None]]:
-    """Yield the usable images, each with its camera, without a readout time, if it is known.
-
-    Args:
-        refused: receives the first detail of each reason of those that cannot be used.
-
-    Raises:
-        DetectError: when they and their calibration differ in size, or, without one, they are of
-            several sizes.
-    """
-    cameras, size = Cameras(scan_direction), None
-    for shot in shots:
-        if isinstance(shot, Carried):
-            continue
-        image = shot.image
-        if isinstance(image, Refusal):
-            refused.setdefault(image.reason, image.detail)
-            continue
-        camera = None if shot.camera_info is None else cameras.camera_of(shot, image)
-        if isinstance(camera, Refusal):
-            refused.setdefault(camera.reason, camera.detail)
-            continue
-        size = size or image.pixels.shape
-        if camera is None and image.pixels.shape != size:
-            (height, width), (other, across) = size, image.pixels.shape
-            raise DetectError(
-                f"the image at {1e-9 * image.stamp_ns:.3f} s is of {across}x{other}, those before "
-                f"it are of {width}x{height}: a lens is calibrated with images of one size"
-            )
-        yield image, camera
-    cameras.check()
-
-
 def _why(size: tuple[int, int], calibrated: tuple[int, int]) -> str:
     """Describe the relation of two sizes of images."""
     if size == calibrated[::-1]:
@@ -347,7 +343,8 @@ def record_features(
         DetectError: when no image has keypoints, or images and calibration differ in size.
     """
     extraction = Extraction()
-    for shot, image, _ in _readable(shots, bag, extraction, options, done):
+    kept = _kept(shots, bag, extraction)
+    for shot, image, _ in usable(kept, options.scan_direction, extraction, done):
         extracted = extractor.extract(image)
         if len(extracted.features):
             extraction.counts.append(len(extracted.features))

@@ -12,11 +12,11 @@ import numpy as np
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
-from rs_localizer.io.bags import BagReader, make_message
+from rs_localizer.io.bags import BagReader
 from rs_localizer.io.image_clock import ImageClock
 from rs_localizer.io.images import Image, read_any_image
-from rs_localizer.io.messages import make_header, stamp_ns
-from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info
+from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info, make_image
 from rs_localizer.io.video import Video
 from rs_localizer.offline.replay import CARRIED_TYPES, as_tf2
 from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
@@ -72,7 +72,7 @@ def from_video(path: Path, camera: Camera | None, clock: ImageClock) -> Iterator
             lost = Refusal(Reason.NO_STAMP, "it has no presentation time")
             yield Shot(lost, _info(camera, 0, frame), None, 0)
         else:
-            compressed = _compressed(now, frame, jpeg, "jpeg")
+            compressed = make_image(now, "jpeg", jpeg)
             yield Shot(Image(now, frame, gray), _info(camera, now, frame), compressed, now)
     clock.missing, clock.captured = video.fault, video.captured
 
@@ -85,7 +85,7 @@ def from_files(files: list[Path], camera: Camera | None, clock: ImageClock) -> I
         now = clock.relative(None) if own is None else clock.absolute(own)
         assert now is not None  # a clock without a rate has refused
         packed = _FORMATS[file.suffix.lower()]
-        compressed = _compressed(now, CAMERA_FRAME, file.read_bytes(), packed)
+        compressed = make_image(now, packed, file.read_bytes())
         image = read_or_refuse(read_any_image, compressed, Reason.BAD_IMAGE)
         if isinstance(image, Refusal):
             image = Refusal(image.reason, f"{file.name}: {image.detail}")
@@ -151,29 +151,6 @@ def name_times(files: Sequence[Path]) -> dict[Path, int] | None:
     return known if len(set(known.values())) == len(files) else None
 
 
-def find_topic(bag: BagReader, types: tuple[str, ...], given: str | None, option: str) -> str:
-    """Return the topic of one of these types, given or the only one.
-
-    Raises:
-        SourceError: when it is not there, or several could be meant.
-    """
-    of_type = sorted(topic for topic, kind in bag.topics.items() if kind in types)
-    known = ", ".join(of_type) or "none"
-    if given is not None:
-        if given not in of_type:
-            raise SourceError(f"{bag.path} has no topic {given} of that kind; it has {known}")
-        return given
-    if len(of_type) != 1:
-        what = "several topics" if of_type else "no topic"
-        choose = f"; choose one with {option}" if of_type else ""
-        if types == (INFO_TYPE,) and not of_type:  # as a part of a split recording has it
-            choose = "; give --calibration FILE"
-        if types == IMAGE_TYPES and not of_type:
-            known = f"it has {', '.join(f'{name} ({kind})' for name, kind in bag.topics.items())}"
-        raise SourceError(f"{bag.path} has {what} of type {' or '.join(types)}: {known}{choose}")
-    return of_type[0]
-
-
 def from_bag(
     bag: BagReader, image_topic: str, info_topic: str | None, camera: Camera | None
 ) -> Iterator[Shot | Carried]:
@@ -202,15 +179,6 @@ def from_bag(
                 frame = str(message.header.frame_id) or CAMERA_FRAME
                 info = make_camera_info(camera, stamp_ns(message), frame)
             yield Shot(image, info, compressed, recorded_ns)
-
-
-def _compressed(stamp: int, frame: str, data: bytes, format_: str) -> Any:
-    return make_message(
-        IMAGE_TYPES[1],
-        header=make_header(make_message, stamp, frame),
-        format=format_,
-        data=np.frombuffer(data, np.uint8),
-    )
 
 
 def _info(camera: Camera | None, stamp: int, frame: str) -> Any:

@@ -10,7 +10,7 @@ import numpy as np
 
 from rs_localizer import matching
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.io.bags import BagReader
+from rs_localizer.io.bags import BagError, BagReader
 from rs_localizer.io.camera_info import Calibration, read_camera_info
 from rs_localizer.io.clouds import Correspondences, read_correspondences, read_keypoints, read_map
 from rs_localizer.io.imu import ImuRecording, read_imu
@@ -19,7 +19,7 @@ from rs_localizer.io.messages import MessageError
 from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, KEYPOINTS, MAP_POINTS
 from rs_localizer.io.transforms import Transform, TransformError, TransformTree
 from rs_localizer.matching import Matcher, MatchError
-from rs_localizer.offline.image_sources import IMAGE_TYPES, INFO_TYPE, SourceError, find_topic
+from rs_localizer.offline.image_sources import IMAGE_TYPES, INFO_TYPE
 from rs_localizer.offline.replay import TF_TYPE, Topics, as_tf2, imu_topics, tf_topics
 from rs_localizer.pipeline.inputs import IMU_TYPE
 
@@ -90,12 +90,12 @@ def read_imu_recording(bag: BagReader, topic: str | None, camera_frame: str) -> 
         camera_frame: optical frame of the camera.
 
     Raises:
-        SourceError: when the topic is not there, or several could be meant.
+        BagError: when the topic is not there, or several could be meant.
         RecordingError: when none of its messages can be used, with the reason.
     """
     if topic is None and len(found := imu_topics(bag)) == 1:
         topic = found[0]
-    topic = find_topic(bag, (IMU_TYPE,), topic, "--imu")
+    topic = bag.find_topic((IMU_TYPE,), topic, "-r imu:=TOPIC")
     stamps, rates, frame, fault = [], [], "", ""
     for _, _, message in bag.messages([topic]):
         try:
@@ -124,8 +124,8 @@ def optical_frame(bag: BagReader, info: str | None = None, image: str | None = N
     """
     for types, topic in (((INFO_TYPE,), info), (IMAGE_TYPES, image)):
         try:
-            source = find_topic(bag, types, topic, "")
-        except SourceError:
+            source = bag.find_topic(types, topic, "")
+        except BagError:
             continue
         for _, _, message in bag.messages([source]):
             return str(message.header.frame_id)

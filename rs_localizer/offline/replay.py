@@ -147,7 +147,7 @@ def find_topics(bag: BagReader, given: Mapping[str, str | None] | None = None) -
             used = name == frames.needs or all(name != other.needs for other in INPUTS.values())
             needed = used and (item.necessary or name in wanted or bool(_named(bag, item)))
         if needed:
-            chosen[name] = _find(bag, item, wanted.get(name))
+            chosen[name] = bag.find_topic(item.types, wanted.get(name), item.option, item.topic)
     return Topics(chosen)
 
 
@@ -173,10 +173,12 @@ def find_rig_topics(
     for name in cameras:
         for own in (f"{name}/{CAMERA_INFO}", f"{name}/{kind}"):
             if own not in chosen:
-                raise BagError(f"{bag.path} has no topic {own}; it has {_describe(bag.topics)}")
+                raise BagError(f"{bag.path} has no topic {own}; it has {_list(sorted(bag.topics))}")
     map_topic = (given or {}).get(MAP_POINTS)
     if kind == KEYPOINTS and (map_topic or _named(bag, INPUTS[MAP_POINTS])):
-        chosen[MAP_POINTS] = _find(bag, INPUTS[MAP_POINTS], map_topic)
+        chosen[MAP_POINTS] = bag.find_topic(
+            INPUTS[MAP_POINTS].types, map_topic, INPUTS[MAP_POINTS].option, MAP_POINTS
+        )
     return Topics(chosen)
 
 
@@ -246,29 +248,6 @@ def _named(bag: BagReader, item: Input) -> list[str]:
         topic
         for topic, kind in bag.topics.items()
         if kind in item.types and topic.split("/")[-1] == item.topic
-    )
-
-
-def _find(bag: BagReader, item: Input, given: str | None) -> str:
-    of_type = sorted(topic for topic, kind in bag.topics.items() if kind in item.types)
-    if given is not None:
-        if given in of_type:
-            return given
-        fault = f"is of type {bag.topics[given]}" if given in bag.topics else "does not exist"
-        raise BagError(
-            f"{bag.path}: topic {given} {fault}; topics of type {item.type}: {_list(of_type)}"
-        )
-    for candidates in (_named(bag, item), of_type):
-        if len(candidates) == 1:
-            return candidates[0]
-        if candidates:
-            raise BagError(
-                f"{bag.path}: several topics may be the {item.topic}: {_list(candidates)}; "
-                f"choose one with {item.option}"
-            )
-    raise BagError(
-        f"{bag.path} has no topic of type {item.type} for the {item.topic}; it has "
-        f"{_describe(bag.topics)}"
     )
 
 
@@ -425,7 +404,3 @@ def _each(results: Results) -> Iterable[Localized | Refusal]:
 
 def _list(topics: list[str]) -> str:
     return ", ".join(topics) or "none"
-
-
-def _describe(topics: Mapping[str, str]) -> str:
-    return ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))

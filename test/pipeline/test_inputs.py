@@ -12,7 +12,7 @@ import pytest
 import rs_localizer
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.reasons import Reason
-from rs_localizer.io.bags import BagError
+from rs_localizer.io.bags import BagError, BagReader
 from rs_localizer.io.topics import GIVEN_POSES
 from rs_localizer.offline.replay import NO_FRAMES, find_topics
 from rs_localizer.pipeline.camera_frames import CameraFrames
@@ -24,7 +24,8 @@ INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
 
 
 def bag(**topics: str) -> Any:
-    return SimpleNamespace(path="bag", topics={f"/{name}": kind for name, kind in topics.items()})
+    connections = [SimpleNamespace(topic=f"/{it}", msgtype=kind) for it, kind in topics.items()]
+    return BagReader(Path("bag"), SimpleNamespace(connections=connections))
 
 
 def test_the_page_of_the_node_has_every_input_with_its_type():
@@ -72,7 +73,7 @@ def test_topics_are_found_by_name_then_by_type():
 
 
 def test_what_is_not_there_or_not_clear_is_said():
-    with pytest.raises(BagError, match="CameraInfo for the camera_info"):
+    with pytest.raises(BagError, match="CameraInfo for -r camera_info:=TOPIC"):
         find_topics(bag(correspondences=CLOUD))
     with pytest.raises(BagError, match="choose with -r correspondences:=TOPIC or -r keyp"):
         find_topics(bag(correspondences=CLOUD, keypoints=CLOUD, camera_info=INFO))

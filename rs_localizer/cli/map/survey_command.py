@@ -24,7 +24,7 @@ if WORKING:
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.markers.maps import MarkerMap, other_units
     from rs_localizer.markers.prints import Marker
-    from rs_localizer.offline.detect import seen_by
+    from rs_localizer.offline.detect import ImageTally, usable
     from rs_localizer.tools.mapping.survey import MISFIT, Survey, survey
     from rs_localizer.tools.mapping.unknown_markers import Filmed, Spotted, Spotter, every_marker
 
@@ -103,14 +103,14 @@ def _filmed(args: Options, config: NodeConfig, spotter: Spotter) -> Filmed:
     spotted = dict[int, Spotted]()
     camera: Camera | None = None
     with opened(args) as source:
-        refused = dict[str, str]()
-        seen = seen_by(source.shots, config.scan_direction, refused)
-        for image, own in tqdm(seen, unit="image", desc="detect", disable=None):
+        tally = ImageTally()
+        seen = usable(source.shots, config.scan_direction, tally)
+        for _, image, own in tqdm(seen, unit="image", desc="detect", disable=None):
             if camera is not None and own is not camera:
                 raise ValueError("camera_info changes within the recording; cut it there")
             camera, stamp = own, image.stamp_ns
             spotted[stamp] = spotter.spot(image.pixels, stamp)
-    print_left_out(refused)
+    print_left_out(tally.refused)
     print_times(source.clock)
     if camera is None:
         raise ValueError(f"{args.recording} has no image that can be read")

@@ -20,9 +20,8 @@ from rs_localizer.features.extraction import FeatureExtractor, Features
 from rs_localizer.io.images import Gray, Image
 from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.offline.detect import Cameras
+from rs_localizer.offline.detect import ImageTally, usable
 from rs_localizer.offline.image_sources import Carried, Shot
-from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.tools.mapping import MappingError
 from rs_localizer.tools.mapping.structure import image_name
 
@@ -87,20 +86,12 @@ class Looker:
 
 
 @dataclass(slots=True)
-class Looked:
+class Looked(ImageTally):
     """Views of a recording."""
 
     views: list[SeenImage] = field(default_factory=list)
     camera: Camera | None = None  # without its readout time; None: nobody has calibrated it
-    images: int = 0
     moments: dict[float, int] = field(default_factory=dict)  # asked for, s -> row of its view
-    refused: dict[str, str] = field(default_factory=dict)  # the first detail of each reason
-    stamps_ns: list[int] = field(default_factory=list)
-
-    @property
-    def period(self) -> float:
-        """s from one image to the next, median; NaN for a single one."""
-        return float(np.median(np.diff(self.stamps_ns))) * 1e-9 if self.stamps_ns[1:] else np.nan
 
 
 def look_through(
@@ -116,24 +107,11 @@ def look_through(
     Raises:
         ValueError: for a camera that changes, or images without features.
     """
-    found, cameras, size = Looked(), Cameras(ScanDirection.TOP_TO_BOTTOM), None
-    for shot in shots:
-        if isinstance(shot, Carried):
-            continue
-        found.images += 1
-        done()
-        image = shot.image
-        if isinstance(image, Refusal):
-            found.refused.setdefault(image.reason, image.detail)
-            continue
-        camera = None if shot.camera_info is None else cameras.camera_of(shot, image)
-        if isinstance(camera, Refusal):
-            found.refused.setdefault(camera.reason, camera.detail)
-            continue
-        if size not in (None, image.pixels.shape) or (found.views and camera is not found.camera):
+    found = Looked()
+    for _, image, camera in usable(shots, ScanDirection.TOP_TO_BOTTOM, found, done):
+        if found.views and camera is not found.camera:
             raise ValueError("the camera changes within the recording; cut it there")
-        found.camera, size = camera, image.pixels.shape
-        found.stamps_ns.append(image.stamp_ns)
+        found.camera = camera
         since = (image.stamp_ns - found.stamps_ns[0]) * 1e-9
         asked = [s for s in moments if s not in found.moments and since >= s - 1e-3]
         found.moments |= dict.fromkeys(asked, len(found.views))
@@ -142,7 +120,6 @@ def look_through(
             found.views.append(looker.detect_in(image))
             if len(found.views) == _EARLY_VIEWS:
                 check_features(found.views)
-    cameras.check()
     return found
 
 
