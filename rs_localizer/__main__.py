@@ -35,8 +35,7 @@ def run() -> int:
     with StopSignals() as signals:
 
         def importing(name: str) -> "AbstractContextManager[None]":
-            signals.last_words = f"{name}: interrupted\n"
-            return signals.at_once(None, signals.last_words)
+            return signals.at_once(None, f"{name}: interrupted\n")
 
         code = 0
         try:

@@ -16,7 +16,7 @@ import signal
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _UNFINISHED = ".unfinished-"
 _OLD = ".old"  # of a workplace, for earlier results
 # A disk of its own (ext4) has this from the start.

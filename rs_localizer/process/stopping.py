@@ -7,6 +7,7 @@ Imports nothing that takes time, so that a program can begin with it.
 
 import contextlib
 import faulthandler
+import math
 import os
 import signal
 import sys
@@ -23,14 +24,8 @@ _SIGNALLED = 128
 INTERRUPTED = _SIGNALLED + signal.SIGINT
 """Exit code after Ctrl-C."""
 
-# An import that breaks off leaves half a module.
-_FRAGILE = ("importlib", "_frozen_importlib")
-# A child that has been started but not been returned is nobody's: nobody would end it.
-_STARTS = "Popen.__init__"
-# s: how often it is tried to interrupt them; so long an import may take, of which nothing stays.
-_PERIOD, _PATIENCE = 0.02, 2.0
-# s until an exception that nobody handles counts as lost, as in a finalizer; unwinding takes less.
-_LOST = 0.5
+# s between signals that are one wish.
+_TOGETHER = 1.0
 
 
 class StopRequest:
@@ -81,13 +76,12 @@ class StopRequest:
         finally:
             self._at_once = before
 
-    def _take(self, number: int, frame: FrameType | None) -> None:
+    def _take(self, number: int, _: FrameType | None) -> None:
         StopRequest.code = _SIGNALLED + number
         if self._at_once is not None:
             self._leave(*self._at_once)
-        first, self.requested = not self.requested, True
-        if first:
-            self._stop(frame)
+        self.requested = True
+        self._stop()
 
     def _leave(self, code: int | None, text: str) -> None:
         for function in self.clean_up:
@@ -95,70 +89,24 @@ class StopRequest:
         os.write(2, text.encode())
         os._exit(self.code if code is None else code)
 
-    def _stop(self, frame: FrameType | None) -> None:
-        """Take the first signal."""
+    def _stop(self) -> None:
+        """Take a signal."""
 
 
 class StopSignals(StopRequest):
-    """The first signal raises KeyboardInterrupt in the main thread; more change nothing.
+    """A signal raises KeyboardInterrupt in the main thread.
 
-    It waits until none of :data:`_FRAGILE` is on the stack, and no process is being started, at
-    most :data:`_PATIENCE`: then the process ends. Where the exception gets lost, it is raised
-    again.
-    Enter it before ``rclpy.init``: rclpy's own handlers call those that they found.
+    Others that follow at once change nothing: a launch file and a terminal send theirs at the same
+    time.
     """
 
-    last_words = "interrupted\n"
-    """Written to stderr where the process ends in the middle of its work."""
+    _last = -math.inf
 
-    def __exit__(self, *_: object) -> None:
-        super().__exit__()
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-
-    def _stop(self, frame: FrameType | None) -> None:
-        self._deadline = time.monotonic() + _PATIENCE
-        signal.signal(signal.SIGALRM, lambda _, frame: self._interrupt(frame))
-        sys.unraisablehook = self._repeat
-        self._due = True
-        self._interrupt(frame)
-
-    def _repeat(self, lost: "sys.UnraisableHookArgs") -> None:
-        """Repeat an interrupt that a finalizer has lost."""
-        if lost.exc_type is KeyboardInterrupt:
-            self._due = True
-            signal.setitimer(signal.ITIMER_REAL, _PERIOD)
-        else:
-            sys.__unraisablehook__(lost)
-
-    def _interrupt(self, frame: FrameType | None) -> None:
-        """Raise where nobody handles an exception, twice in a row: an end takes less."""
-        handled = _is_handled(sys.exception())
-        fragile = not handled and _is_fragile(frame)
-        raised = self._due and not handled and not fragile
-        self._due = not handled and not raised
-        signal.setitimer(signal.ITIMER_REAL, _PERIOD if self._due else _LOST)
-        if raised:
+    def _stop(self) -> None:
+        now = time.monotonic()
+        before, self._last = self._last, now
+        if now - before > _TOGETHER:
             raise KeyboardInterrupt
-        if fragile and time.monotonic() > self._deadline:
-            self._leave(None, self.last_words)
-
-
-def _is_fragile(frame: FrameType | None) -> bool:
-    while frame is not None:
-        name = str(frame.f_globals.get("__name__"))
-        if name.partition(".")[0] in _FRAGILE:
-            return True
-        if name == "subprocess" and frame.f_code.co_qualname == _STARTS:
-            return True
-        frame = frame.f_back
-    return False
-
-
-def _is_handled(error: BaseException | None) -> bool:
-    """Return True if some code cleans up after a KeyboardInterrupt."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or error.__context__
-    return error is not None
 
 
 @contextlib.contextmanager

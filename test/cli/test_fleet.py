@@ -57,7 +57,7 @@ def test_two_workers_write_the_bytes_of_one_process(recordings, tmp_path, capsys
     table = rows(out)
     assert list(table) == ["a_flight", "b_flight", "notes"]
     assert table["a_flight"]["frames"] == table["a_flight"]["localized"] == "7"
-    assert table["notes"]["reason"].startswith(f"{recordings[2]} is not a recording: ")
+    assert table["notes"]["reason"].startswith(f"{recordings[2]} cannot be read as a recording: ")
     assert table["a_flight"]["reason"] == ""
     assert main(["replay", recordings[0], *SHUTTER, "--out", str(tmp_path / "alone")]) == 0
     alone = filecmp.dircmp(tmp_path / "alone", out / "a_flight")
