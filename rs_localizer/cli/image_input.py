@@ -17,6 +17,7 @@ from rs_localizer.io.camera_files import CALIBRATION_KINDS, read_calibration
 from rs_localizer.io.image_clock import ImageClock, readout_fault
 from rs_localizer.io.recording import PARAMETERS
 from rs_localizer.io.topics import CAMERA_INFO, IMAGE
+from rs_localizer.pipeline.inputs import CAMERA_INFO_TYPE, IMAGE_TYPES
 from rs_localizer.settings import camera_values
 
 if WORKING:
@@ -24,8 +25,6 @@ if WORKING:
     from rs_localizer.io.bags import is_bag, open_bag
     from rs_localizer.io.video import has_times
     from rs_localizer.offline.image_sources import (
-        IMAGE_TYPES,
-        INFO_TYPE,
         Carried,
         Shot,
         from_bag,
@@ -123,9 +122,9 @@ def opened(args: ImageOptions, calibrated: bool = True) -> Iterator[Source]:
         topics, info = remapped(args), None
         with open_bag(path) as bag:
             topic = bag.find_topic(IMAGE_TYPES, topics.get(IMAGE), "-r image:=TOPIC")
-            if camera is None and (calibrated or INFO_TYPE in bag.topics.values()):
+            if camera is None and (calibrated or CAMERA_INFO_TYPE in bag.topics.values()):
                 option = "-r camera_info:=TOPIC, or give --camera FILE"
-                info = bag.find_topic((INFO_TYPE,), topics.get(CAMERA_INFO), option)
+                info = bag.find_topic((CAMERA_INFO_TYPE,), topics.get(CAMERA_INFO), option)
             yield Source(from_bag(bag, topic, info, camera), bag.count([topic]), None)
         return
     if args.remaps:

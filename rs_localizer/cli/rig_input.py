@@ -21,7 +21,8 @@ if WORKING:
     from rs_localizer.config import NodeConfig
     from rs_localizer.core.arrays import Array
     from rs_localizer.io.bags import is_bag, open_bag
-    from rs_localizer.offline.recordings import camera_topics, optical_frame
+    from rs_localizer.offline.recordings import optical_frame
+    from rs_localizer.offline.replay import camera_topics
     from rs_localizer.tools.adjust.variables import Extrinsics
     from rs_localizer.tools.verdict import numbers
 

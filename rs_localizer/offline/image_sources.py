@@ -19,10 +19,9 @@ from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info, make_image
 from rs_localizer.io.video import Video
 from rs_localizer.offline.replay import CARRIED_TYPES, as_tf2
+from rs_localizer.pipeline.inputs import IMAGE_TYPES
 from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
 
-IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 _FORMATS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png"}  # of image files
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".mjpeg", ".mjpg", ".m4v", ".h264", ".ts",
            ".insv")  # fmt: skip

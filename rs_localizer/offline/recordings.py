@@ -3,7 +3,6 @@
 """All correspondences, or the whole IMU, of a recording at once: for estimators of many images."""
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,9 +18,8 @@ from rs_localizer.io.messages import MessageError
 from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, KEYPOINTS, MAP_POINTS
 from rs_localizer.io.transforms import Transform, TransformError, TransformTree
 from rs_localizer.matching import Matcher, MatchError
-from rs_localizer.offline.image_sources import IMAGE_TYPES, INFO_TYPE
 from rs_localizer.offline.replay import TF_TYPE, Topics, as_tf2, imu_topics, tf_topics
-from rs_localizer.pipeline.inputs import IMU_TYPE
+from rs_localizer.pipeline.inputs import CAMERA_INFO_TYPE, IMAGE_TYPES, IMU_TYPE
 
 
 class RecordingError(ValueError):
@@ -122,7 +120,7 @@ def optical_frame(bag: BagReader, info: str | None = None, image: str | None = N
     Args:
         info, image: topics; None: the only one of its type.
     """
-    for types, topic in (((INFO_TYPE,), info), (IMAGE_TYPES, image)):
+    for types, topic in (((CAMERA_INFO_TYPE,), info), (IMAGE_TYPES, image)):
         try:
             source = bag.find_topic(types, topic, "")
         except BagError:
@@ -130,35 +128,6 @@ def optical_frame(bag: BagReader, info: str | None = None, image: str | None = N
         for _, _, message in bag.messages([source]):
             return str(message.header.frame_id)
     return ""
-
-
-def camera_topics(
-    bag: BagReader, cameras: Sequence[str] | None = None
-) -> dict[str, dict[str, str]]:
-    """Return the topics of each camera of a rig by the names of their inputs.
-
-    Args:
-        cameras: names, which are prefixes of the topics; None: all cameras.
-
-    Raises:
-        RecordingError: when one has no camera_info or nothing to localize.
-    """
-    there: dict[str, dict[str, str]] = {}
-    for info in sorted(topic for topic, kind in bag.topics.items() if kind == INFO_TYPE):
-        prefix = info.rpartition("/")[0]
-        own = {topic: kind for topic, kind in bag.topics.items() if topic.startswith(f"{prefix}/")}
-        topics = [(name, f"{prefix}/{name}") for name in (CORRESPONDENCES, KEYPOINTS)]
-        topics = [pair for pair in topics if pair[1] in own]
-        topics += [("image", topic) for topic in sorted(own) if own[topic] in IMAGE_TYPES]
-        if prefix and topics:
-            there[prefix.rpartition("/")[2]] = {CAMERA_INFO: info, **dict(topics[:1])}
-    names = list(there) if cameras is None else list(cameras)
-    if missing := [name for name in names if name not in there] or (len(names) < 2 and ["another"]):
-        raise RecordingError(
-            f"{bag.path} has no camera_info beside correspondences, keypoints or images of "
-            f"{', '.join(missing)}; it has those of {', '.join(there) or 'no camera'}"
-        )
-    return {name: there[name] for name in names}
 
 
 def transform_between(bag: BagReader, camera: str, imu: str) -> Transform | None:

@@ -23,6 +23,7 @@ from rs_localizer.io.topics import (
     CAMERA_INFO,
     CORRESPONDENCES,
     DETECTIONS,
+    IMAGE,
     IMU,
     KEYPOINTS,
     MAP_POINTS,
@@ -32,6 +33,8 @@ from rs_localizer.io.topics import (
 from rs_localizer.io.transforms import TransformError, TransformTree
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import (
+    CAMERA_INFO_TYPE,
+    IMAGE_TYPES,
     IMU_TYPE,
     INPUTS,
     Input,
@@ -164,39 +167,46 @@ def find_rig_topics(
             f"{INPUTS[named[0]].option} is for one camera; of the cameras {', '.join(cameras)} "
             "topics are found by their names"
         )
-    there = {
-        item.topic: _of_cameras(bag, item, cameras)
-        for item in (INPUTS[CORRESPONDENCES], INPUTS[KEYPOINTS])
-    }
-    kind = max(there, key=lambda name: len(there[name]))
-    chosen = _of_cameras(bag, INPUTS[CAMERA_INFO], cameras) | there[kind]
-    for name in cameras:
-        for own in (f"{name}/{CAMERA_INFO}", f"{name}/{kind}"):
-            if own not in chosen:
-                raise BagError(f"{bag.path} has no topic {own}; it has {_list(sorted(bag.topics))}")
+    there = camera_topics(bag, cameras)
+    kinds = {next(kind for kind in own if kind != CAMERA_INFO) for own in there.values()}
+    kind = kinds.pop()
+    if kinds or kind == IMAGE:
+        raise BagError(f"{bag.path}: all cameras need {CORRESPONDENCES}, or all {KEYPOINTS}")
+    chosen = {f"{name}/{it}": there[name][it] for it in (CAMERA_INFO, kind) for name in cameras}
     map_topic = (given or {}).get(MAP_POINTS)
     if kind == KEYPOINTS and (map_topic or _named(bag, INPUTS[MAP_POINTS])):
-        chosen[MAP_POINTS] = bag.find_topic(
-            INPUTS[MAP_POINTS].types, map_topic, INPUTS[MAP_POINTS].option, MAP_POINTS
-        )
+        item = INPUTS[MAP_POINTS]
+        chosen[MAP_POINTS] = bag.find_topic(item.types, map_topic, item.option, item.topic)
     return Topics(chosen)
 
 
-def _of_cameras(bag: BagReader, item: Input, cameras: Sequence[str]) -> dict[str, str]:
-    """Return the topics of an input of each camera, by ``NAME/input``."""
-    chosen: dict[str, str] = {}
-    for name in cameras:
-        own = f"{name}/{item.topic}"
-        topics = sorted(
-            topic
-            for topic, kind in bag.topics.items()
-            if kind in item.types and f"/{topic}".endswith(f"/{own}")
+def camera_topics(
+    bag: BagReader, cameras: Sequence[str] | None = None
+) -> dict[str, dict[str, str]]:
+    """Return the topics of each camera of a rig by the names of their inputs.
+
+    Args:
+        cameras: names, which are prefixes of the topics; None: all cameras.
+
+    Raises:
+        BagError: when one has no camera_info or nothing to localize.
+    """
+    there: dict[str, dict[str, str]] = {}
+    for info in sorted(topic for topic, kind in bag.topics.items() if kind == CAMERA_INFO_TYPE):
+        prefix = info.rpartition("/")[0]
+        own = {topic: kind for topic, kind in bag.topics.items() if topic.startswith(f"{prefix}/")}
+        topics = [(name, f"{prefix}/{name}") for name in (CORRESPONDENCES, KEYPOINTS)]
+        topics = [pair for pair in topics if pair[1] in own]
+        topics += [(IMAGE, topic) for topic in sorted(own) if own[topic] in IMAGE_TYPES]
+        if prefix and topics:
+            there[prefix.rpartition("/")[2]] = {CAMERA_INFO: info, **dict(topics[:1])}
+    names = list(there) if cameras is None else list(cameras)
+    if missing := [name for name in names if name not in there] or (len(names) < 2 and ["another"]):
+        raise BagError(
+            f"{bag.path} has no camera_info beside correspondences, keypoints or images of "
+            f"{', '.join(missing)}; it has those of {', '.join(there) or 'no camera'}"
         )
-        if len(topics) > 1:
-            raise BagError(f"{bag.path}: several topics may be {own}: {_list(topics)}")
-        for topic in topics:
-            chosen[own] = topic
-    return chosen
+    return {name: there[name] for name in names}
 
 
 def _choose_frames(bag: BagReader, wanted: Mapping[str, str]) -> Input:
@@ -400,7 +410,3 @@ def _each(results: Results) -> Iterable[Localized | Refusal]:
     if results is None:
         return []
     return results if isinstance(results, Iterator) else [results]
-
-
-def _list(topics: list[str]) -> str:
-    return ", ".join(topics) or "none"

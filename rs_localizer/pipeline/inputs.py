@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 IMU_TYPE = "sensor_msgs/msg/Imu"
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 
 
 Results = Union["Localized", Refusal, Iterator[Union["Localized", Refusal]], None]
