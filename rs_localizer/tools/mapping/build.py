@@ -241,8 +241,7 @@ def _refined(
     inputs: Given, observations: MapObservations, start: Start, camera: Camera, work: Workshop
 ) -> tuple[RefinedMap, ShutterFit | None, ReadoutCheck | None]:
     """Return the refined map, a shutter that was unknown or wrong, the check of a given one."""
-    freedom = colmap_freedom(observations, start, inputs.camera is None)
-    freedom = replace(freedom, drifts=_MODES)
+    freedom = replace(colmap_freedom(inputs.camera is None), drifts=_MODES)
     if inputs.anchors.marker_map is not None:
         corners = _corners(inputs, observations.stamps_ns)
         places = inputs.anchors.marker_map.points

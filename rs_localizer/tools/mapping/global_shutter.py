@@ -83,7 +83,7 @@ def undo_shutter(
         )
     camera = replace(camera, scan_direction=likely_axis(camera.size, shutter[1]))
     refined, found, check = refine_with_shutter(
-        camera, some, near, colmap_freedom(some, near, lens), shutter[0], done
+        camera, some, near, colmap_freedom(lens), shutter[0], done
     )
     motion = ViewMotion(used, refined.times, refined)
     projected = motion.sights(seen.images, seen.landmarks, seen.pixels)

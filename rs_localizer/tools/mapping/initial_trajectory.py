@@ -53,24 +53,6 @@ def initial_trajectory(
     return spline_through(parts, times, rotations, positions, spacing, margin)
 
 
-def usual_accelerations(times: Array, rotations: Array, positions: Array) -> tuple[float, float]:
-    """Return rms accelerations of successive images (g,): rad/s^2, m/s^2, or 0."""
-    steps = np.diff(times)
-    follow = following(times, rotations)
-    near = follow[1:] & follow[:-1]
-    if not near.any():
-        return 0.0, 0.0
-    relative = np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:]
-    turns = Rotation.from_matrix(relative).as_rotvec() / steps[:, None]
-    speeds = np.diff(positions, axis=0) / steps[:, None]
-    between = 0.5 * (steps[1:] + steps[:-1])[:, None]
-    angular, linear = (
-        float(np.sqrt(np.mean(np.square(np.diff(of, axis=0) / between)[near])))
-        for of in (turns, speeds)
-    )
-    return angular, linear
-
-
 def acceleration_prior(state: Unknowns, freedom: Freedom) -> Freedom | None:
     """Return a prior of accelerations as large as the motion's own, if stretches suffice."""
     layout = state.spline.layout

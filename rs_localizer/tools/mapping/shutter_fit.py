@@ -15,7 +15,6 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.tools.adjust.problem import noise_of
 from rs_localizer.tools.adjust.reprojection import LIMIT
-from rs_localizer.tools.mapping.initial_trajectory import usual_accelerations
 from rs_localizer.tools.mapping.map_keypoints import MapFreedom, MapObservations, Start
 from rs_localizer.tools.mapping.refinement import RefinedMap, refine
 from rs_localizer.tools.readout_belief import ReadoutCheck, ShutterFit
@@ -41,21 +40,9 @@ def likely_axis(size: tuple[int, int], given: str | None) -> ScanDirection:
 _LENS_DEVIATIONS = 0.005, 0.02
 
 
-def colmap_freedom(seen: MapObservations, start: Start, lens: bool) -> MapFreedom:
-    """Return the unknowns of a map that COLMAP has begun; ``lens``: its lens, too.
-
-    A time lapse, whose stamps are closer than its images were, moves faster than any hand.
-    """
-    times = 1e-9 * (seen.stamps_ns - seen.stamps_ns[0])
-    angular, linear = usual_accelerations(times, start.rotations, start.positions)
-    usual = MapFreedom()
-    return replace(
-        usual,
-        lens=lens,
-        lens_deviations=_LENS_DEVIATIONS,
-        angular_acceleration=max(usual.angular_acceleration, angular),
-        linear_acceleration=max(usual.linear_acceleration, linear),
-    )
+def colmap_freedom(lens: bool) -> MapFreedom:
+    """Return the unknowns of a map that COLMAP has begun; ``lens``: its lens, too."""
+    return MapFreedom(lens=lens, lens_deviations=_LENS_DEVIATIONS)
 
 
 def fit_shutter(
