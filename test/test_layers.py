@@ -3,6 +3,7 @@
 """Imports inside the package go down only."""
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -93,8 +94,14 @@ def test_imports_go_down_only():
     assert wrong == []
 
 
+# What package.xml names of ROS.
+ROS = {
+    name.removesuffix("_py")
+    for name in re.findall(r"<exec_depend>(\w+)<", (PACKAGE.parent / "package.xml").read_text())
+}
 # Where packages are imported that a localizer does without: what begins so may.
 ONLY_IN = {
+    tuple(sorted(ROS)): ("ros/",),
     ("numba", "llvmlite"): ("native/jit.py", "native/bitcode.py", *TRACED),
     ("scipy",): ("tools/", "cli/"),
     ("matplotlib", "evo"): ("tools/",),

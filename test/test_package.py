@@ -27,8 +27,6 @@ from rs_localizer.native import build
 from rs_localizer.process import missing
 
 ROOT = Path(__file__).parents[1]
-# Names under which package.xml's dependencies are imported, where they differ.
-MODULES = {"tf2_ros_py": "tf2_ros"}
 
 
 def test_package_xml_is_valid_and_of_the_right_kind():
@@ -68,15 +66,10 @@ def wheel(tmp_path_factory) -> Iterator[zipfile.ZipFile]:
         shutil.copy(ROOT / name, source)
     code = f"import setuptools.build_meta as b; b.build_wheel({str(result)!r})"
     inherited = {k: v for k, v in os.environ.items() if k != "AMENT_PREFIX_PATH"}
-    command = [sys.executable, "-c", code]
     made = subprocess.run(
-        command,
-        cwd=source,
-        env=inherited,
-        text=True,
-        capture_output=True,
+        [sys.executable, "-c", code], cwd=source, env=inherited, text=True, capture_output=True,
         check=False,
-    )
+    )  # fmt: skip
     assert made.returncode == 0, made.stderr
     with zipfile.ZipFile(next(result.iterdir())) as archive:
         yield archive
@@ -102,8 +95,6 @@ def test_wheel_puts_shared_files_where_ros_looks(wheel):
     expected |= {f"rs_localizer/config/{path.name}" for path in (ROOT / "config").glob("*")}
     expected |= {f"rs_localizer/launch/{path.name}" for path in (ROOT / "launch").glob("*.py")}
     assert shared == expected
-    assert "rs_localizer/config/rs_localizer.yaml" in shared
-    assert "rs_localizer/launch/localizer.launch.py" in shared
 
 
 def test_declared_commands_can_be_imported(wheel):
@@ -111,49 +102,10 @@ def test_declared_commands_can_be_imported(wheel):
     path = next(n for n in wheel.namelist() if n.endswith(".dist-info/entry_points.txt"))
     declared.read_string(wheel.read(path).decode())
     assert declared.sections() == ["console_scripts"]
-    assert set(declared["console_scripts"]) == {
-        "doctor",
-        "localizer",
-        "marker_detector",
-        "feature_detector",
-        "rs_localizer",
-    }
+    names = "doctor localizer marker_detector feature_detector rs_localizer"
+    assert set(declared["console_scripts"]) == set(names.split())
     for name, value in declared["console_scripts"].items():
         assert callable(EntryPoint(name, value, "console_scripts").load()), value
-
-
-def ros_modules() -> list[str]:
-    """What package.xml names of ROS, by the names that one imports."""
-    depends = [d.name for d in parse_package(str(ROOT / "package.xml")).exec_depends]
-    return [MODULES.get(name, name) for name in depends if not name.startswith("python3-")]
-
-
-def lint(modules: list[str], path: str) -> str:
-    """Ruff's findings in a file at `path` that imports modules."""
-    pytest.importorskip("ruff", reason="Ruff is no package of Ubuntu")
-    ruff = [sys.executable, "-m", "ruff", "check", "--output-format=concise", "--select=TID251"]
-    found = subprocess.run(
-        [*ruff, "--stdin-filename", path, "-"],
-        input="".join(f"import {module}\n" for module in modules),
-        cwd=ROOT,
-        text=True,
-        capture_output=True,
-        check=False,
-    )
-    assert found.returncode in (0, 1), found.stderr
-    return found.stdout
-
-
-@pytest.mark.parametrize(
-    "path",
-    [f"{folder}/x.py" for folder in ("rs_localizer", "rs_localizer/cli", "benchmarks", "test")],
-)
-def test_ros_is_refused_outside_its_place(path):
-    modules = [*ros_modules(), "rclpy.node", "sensor_msgs.msg"]
-    assert {"rclpy", "sensor_msgs", "tf2_ros", "launch"} <= set(modules)
-    lines = lint(modules, path).splitlines()
-    refused = {int(line.split(":")[1]) for line in lines if "TID251" in line}
-    assert [module for k, module in enumerate(modules, 1) if k not in refused] == []
 
 
 DOCKERFILE = ROOT / "packaging" / "docker" / "Dockerfile"
@@ -214,30 +166,16 @@ def test_conda_brings_what_pip_brings(setup_says):
     assert found == wanted
 
 
-def instructions() -> list[tuple[str, list[str]]]:
-    """Those of the Dockerfile, and their words."""
-    text = re.sub(r"^#.*\n", "", DOCKERFILE.read_text(), flags=re.MULTILINE)
-    lines = [line for line in text.replace("\\\n", " ").splitlines() if line.strip()]
-    return [(line.split()[0], shlex.split(line)[1:]) for line in lines]
-
-
 def test_the_container_is_built_of_files_that_exist():
-    stages: set[str] = set()
-    copied: set[str] = set()
-    for word, rest in instructions():
-        if word == "FROM":
-            stages |= {rest[-1]} if "AS" in rest else set()
-        elif word == "COPY" and rest[0].startswith("--from="):
-            assert rest[0].removeprefix("--from=") in stages
-        elif word == "COPY":
-            for name in rest[:-1]:
-                assert (ROOT / name).exists(), name
-            copied |= set(rest[:-1])
+    text = DOCKERFILE.read_text()
+    copied = {
+        name for words in re.findall(r"^COPY (?!--)(.*) \S+$", text, re.MULTILINE)
+        for name in words.split()
+    }  # fmt: skip
+    assert [name for name in copied if not (ROOT / name).exists()] == []
     # All that setup.py reads, and what the commands run.
     assert {"setup.py", "setup.cfg", "pyproject.toml", "package.xml", "README.md"} <= copied
     assert {"rs_localizer", "config", "launch", "resource"} <= copied
-    named = set(re.findall(r"packaging/\S+\.py", DOCKERFILE.read_text()))
-    assert named <= copied
 
 
 def test_beside_ros_pip_requires_nothing(monkeypatch, setup_says):
