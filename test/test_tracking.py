@@ -270,18 +270,22 @@ def test_the_inliers_of_a_track_are_those_of_the_gate_of_their_frame(lag):
     assert beyond > 10  # a gate of the threshold alone would leave these out
 
 
-def test_a_measured_direction_of_gravity_helps_on_a_wall():
+@pytest.mark.parametrize("kind", ["gyroscope", "gravity"])
+def test_a_measured_rate_or_direction_helps_on_a_wall(kind):
     hand, localizer = Hand(), rsl.Localizer(CAMERA)
     rng, errors = np.random.default_rng(4), []
     for t in times(40):
         data, truth = hand.frame(t, 60, WALL), hand.motion(t)
-        down = truth.rotation @ [0, 0, -1.0] + 1e-3 * rng.normal(size=3)
-        prior = rsl.Prior(gravity=9.81 * down, gravity_deviation=1e-3)
-        found = [localizer.localize(*data), localizer.localize(*data, prior=prior)]
-        errors.append([Rotation.from_matrix(one.rotation @ truth.rotation.T).magnitude()
-                       for one in found])  # fmt: skip
-    alone, helped = np.median(errors, axis=0)
-    assert helped < 0.5 * alone
+        rate = truth.angular_velocity + 1e-4 * rng.normal(size=3)
+        prior = rsl.Prior(angular_velocity=rate, angular_velocity_deviation=1e-4)
+        if kind == "gravity":
+            down = truth.rotation @ [0, 0, -1.0] + 1e-3 * rng.normal(size=3)
+            prior = rsl.Prior(gravity=9.81 * down, gravity_deviation=1e-3)
+        for found in localizer.localize(*data), localizer.localize(*data, prior=prior):
+            turn = Rotation.from_matrix(found.rotation @ truth.rotation.T).magnitude()
+            off = np.linalg.norm(found.angular_velocity - truth.angular_velocity)
+            errors.append(turn if kind == "gravity" else off)
+    assert np.median(errors[1::2]) < 0.5 * np.median(errors[::2])
 
 
 def test_with_a_readout_time_far_off_each_image_speaks_for_itself():
