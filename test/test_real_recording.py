@@ -13,12 +13,10 @@ from benchmarks.frames.conditions import REST, TRACKED, Condition
 from benchmarks.frames.judged import judge
 from benchmarks.independent.scenes import Rich
 from rs_localizer import data
-from rs_localizer.core.camera import Camera
 from rs_localizer.core.rig import Mounts
 from rs_localizer.estimation.points import Observations
-from rs_localizer.estimation.prior import PriorTerms, state_in
+from rs_localizer.estimation.prior import state_in
 from rs_localizer.estimation.projection import linearized
-from rs_localizer.estimation.robust import refine
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
@@ -42,30 +40,6 @@ def recording():
     return calibration, clouds
 
 
-def residual(camera: Camera, cloud, start: rsl.Motion, velocities) -> tuple[rsl.Motion, float]:
-    """Pose fitted to all corners with the velocities given, and its rms error in px."""
-    rays, centre = camera.rays(cloud.pixels), cloud.points.mean(axis=0)
-    observations = Observations.of(
-        cloud.points - centre, rays, camera.row_time(cloud.pixels), camera.pixel_jacobian(rays),
-        Mounts.one(camera.row_time_gradient),
-    )  # fmt: skip
-    held = np.concatenate([np.eye(3).ravel(), np.zeros(3), velocities, np.zeros(6)])
-    precision = np.diag(np.concatenate([np.zeros(6), np.full(12, 1e12)]))
-    state = state_in(start, centre)
-    state[12:] = held[12:]
-    state = refine(
-        observations.packed, state, (1e6, 0.0),
-        PriorTerms(precision[None], held[None], np.zeros(7), np.zeros((1, 3))), 0.1, 2, 50, 1e-6,
-    )[0]  # fmt: skip
-    rotation = state[:9].reshape(3, 3)
-    motion = rsl.Motion(rotation, state[9:12] - rotation @ centre, state[12:15], state[15:18])
-    return motion, float(np.sqrt(observations.squared_errors(state).mean()))
-
-
-def state_of(motion):
-    return state_in(motion, np.zeros(3))
-
-
 def central_differences(poses, seconds):
     """Angular (rad/s) and linear (m/s) velocity, camera axes, where both neighbours are there."""
     result = {}
@@ -82,44 +56,6 @@ def central_differences(poses, seconds):
 def fast_half(velocities):
     speeds = {i: np.linalg.norm(rate) for i, (rate, _) in velocities.items()}
     return [i for i, speed in speeds.items() if speed > np.median(list(speeds.values()))]
-
-
-@pytest.fixture(scope="module")
-def still(recording):
-    """Global-shutter poses and residuals, and velocities between them."""
-    calibration, clouds = recording
-    camera = calibration.camera(READOUT, "top_to_bottom")
-    start = rsl.Localizer(camera, solver="p3p")
-    fits = [
-        residual(camera, cloud, start.localize(cloud.points, cloud.pixels), np.zeros(6))
-        for cloud in clouds
-    ]
-    poses, errors = zip(*fits, strict=True)
-    seconds = np.array([cloud.stamp_ns for cloud in clouds]) * 1e-9
-    return poses, np.array(errors), central_differences(poses, seconds)
-
-
-def moving_residuals(recording, still, direction):
-    """Residuals on the fast half with the neighbours' velocities, and the global-shutter ones."""
-    calibration, clouds = recording
-    poses, errors, velocities = still
-    camera = calibration.camera(READOUT, direction)
-    fast = fast_half(velocities)
-    moving = [
-        residual(camera, clouds[i], poses[i], READOUT * np.concatenate(velocities[i]))[1]
-        for i in fast
-    ]
-    return np.array(moving), errors[fast]
-
-
-def test_the_neighbours_velocities_explain_the_shear_of_the_image(recording, still):
-    """The right way; with the scan direction reversed, worse than a global shutter."""
-    moving, standing = moving_residuals(recording, still, "top_to_bottom")
-    assert np.mean(standing) > 0.1
-    assert np.mean(moving) < 0.09
-    assert np.median(moving) < 0.09
-    reversed_moving, _ = moving_residuals(recording, still, "bottom_to_top")
-    assert np.mean(reversed_moving) > 1.2 * np.mean(standing)
 
 
 def test_the_tracked_twist_is_that_of_the_poses(recording):
@@ -160,7 +96,9 @@ def test_corners_lie_where_those_of_other_rows_say(recording):
             points, rays, camera.row_time(pixels), camera.pixel_jacobian(rays),
             Mounts.one(camera.row_time_gradient),
         )  # fmt: skip
-        errors, by_motion, *_ = linearized(observations.packed, len(points), state_of(found), still)
+        errors, by_motion, *_ = linearized(
+            observations.packed, len(points), state_in(found, np.zeros(3)), still
+        )
         motion = found.joint_covariance[:18, :18]
         spread = by_motion @ motion @ np.swapaxes(by_motion, 1, 2)
         # Twelve corners leave some 14 of their 24 coordinates to the noise.
