@@ -6,12 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rs_localizer.config import (
-    DetectorConfig,
-    FeatureConfig,
-    NodeConfig,
-    VelocityPrior,
-)
+from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig, VelocityPrior
 from rs_localizer.settings import SettingsError, build, load_params_file, parse_assignment, settings
 
 SHIPPED = Path(__file__).parents[1] / "config"
@@ -49,35 +44,36 @@ def test_the_shipped_files_hold_exactly_the_defaults_and_name_all_choices(file, 
         assert all(choice in line for choice in setting.choices), name
 
 
-@pytest.mark.parametrize(
-    "heading", ["rs_localizer", "/robot/rs_localizer", "/**/rs_localizer", "/*"]
-)
-def test_headings_that_mean_the_node(tmp_path, heading):
-    path = params(tmp_path, f"{heading}:\n  ros__parameters:\n    seed: 5\n")
-    assert load_params_file(path) == {"seed": 5}
-
-
-def test_nested_names_and_blocks(tmp_path):
-    path = params(
-        tmp_path,
-        """
+OTHERS = "other_node:\n  ros__parameters: {frequency: 3}\n"
+MANY = """
 robot:
   rs_localizer:
     ros__parameters:
       velocity_prior: {angular: 0.5}
       velocity_prior.linear: 1e-3
-other_node:
-  ros__parameters: {frequency: 3}
 /**:
   ros__parameters:
     use_sim_time: true
     qos_overrides: {/camera_info: {subscription: {depth: 3}}}
     seed: 7
-""",
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        *((f"{heading}:\n  ros__parameters:\n    seed: 5\n", {"seed": 5})
+          for heading in ("rs_localizer", "/robot/rs_localizer", "/**/rs_localizer", "/*")),
+        (MANY, {"velocity_prior.angular": 0.5, "velocity_prior.linear": 1e-3, "seed": 7}),
+    ],
+)  # fmt: skip
+def test_what_is_meant_for_the_node(tmp_path, text, values):
+    assert load_params_file(params(tmp_path, text + OTHERS)) == values
+    built = build(values)
+    assert built.seed == values["seed"]
+    assert "velocity_prior.angular" not in values or built.velocity_prior == VelocityPrior(
+        0.5, 1e-3
     )
-    values = load_params_file(path)
-    assert values == {"velocity_prior.angular": 0.5, "velocity_prior.linear": 1e-3, "seed": 7}
-    assert build(values) == NodeConfig(velocity_prior=VelocityPrior(0.5, 1e-3), seed=7)
 
 
 @pytest.mark.parametrize(
