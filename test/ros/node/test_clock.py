@@ -13,17 +13,6 @@ from rs_localizer.ros.node.clock import ClockJumps, watch_clock
 SECOND = 10**9
 
 
-def jumps(times: list[float]) -> list[float]:
-    """The times at which the clock has jumped."""
-    clock, found, before = ClockJumps(), [], 0
-    for time in times:
-        now = round(time * SECOND)
-        if clock.is_jump(before, now - before):
-            found.append(time)
-        before = now
-    return found
-
-
 @pytest.mark.parametrize(
     ("times", "expected"),
     [
@@ -37,7 +26,13 @@ def jumps(times: list[float]) -> list[float]:
     ],
 )
 def test_jumps_are_told_from_steps(times, expected):
-    assert jumps(times) == expected
+    clock, found, before = ClockJumps(), [], 0
+    for time in times:
+        now = round(time * SECOND)
+        if clock.is_jump(before, now - before):
+            found.append(time)
+        before = now
+    assert found == expected
 
 
 def test_a_node_hears_jumps_and_no_steps(peer):

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A topic is heard as well as its publishers send it, whoever comes first."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -19,6 +20,17 @@ BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABL
 VOLATILE, LATCHED = DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL
 ANY = (ReliabilityPolicy.BEST_AVAILABLE, DurabilityPolicy.BEST_AVAILABLE)
 WHOLE = QoSProfile(depth=1, reliability=RELIABLE, durability=LATCHED)
+
+
+@pytest.fixture
+def driver() -> Iterator[Node]:
+    """A node of another process."""
+    context = Context()
+    context.init(args=[])
+    node = Node("driver", context=context)
+    yield node
+    node.destroy_node()
+    context.try_shutdown()
 
 
 @pytest.mark.parametrize(
@@ -68,15 +80,12 @@ def test_a_topic_follows_its_publishers(peer):
     assert not told.counts
 
 
-def test_publishers_that_cannot_be_heard_are_named(peer, monkeypatch):
+def test_publishers_that_cannot_be_heard_are_named(peer, driver, monkeypatch):
     monkeypatch.setattr(inputs_module, "_LONG", 0.0)
     said: list[str] = []
     qos = {"depth": 1, "reliability": RELIABLE}
     topics = {name: Topic(PointCloud2, print, qos) for name in ("one", "other", "third")}
     inputs = Inputs(peer.node, topics, Refusals(said.append))
-    context = Context()
-    context.init(args=[])
-    driver = Node("driver", context=context)
     driver.create_publisher(PointCloud2, "one", QoSProfile(depth=1, reliability=BEST_EFFORT))
     driver.create_publisher(CameraInfo, "other", 1)
     wanted = {
@@ -95,16 +104,11 @@ def test_publishers_that_cannot_be_heard_are_named(peer, monkeypatch):
     lines = [f"incompatible_publisher: no message arrives on /{name}: " for name in wanted]
     assert [any(text.startswith(line) for text in said) for line in lines] == [True, True, False]
     inputs.close()
-    driver.destroy_node()
-    context.try_shutdown()
 
 
-def test_two_publishers_of_frames_are_named(peer):
+def test_two_publishers_of_frames_are_named(peer, driver):
     said: list[str] = []
     topics = {"frames": Topic(PointCloud2, print, single=True), "info": Topic(CameraInfo, print)}
-    context = Context()
-    context.init(args=[])
-    driver = Node("driver", context=context)
     for name, topic in topics.items():
         peer.node.create_publisher(topic.type, name, 1)
         driver.create_publisher(topic.type, name, 1)
@@ -119,5 +123,3 @@ def test_two_publishers_of_frames_are_named(peer):
     names = " and ".join(sorted(("/driver", f"/{peer.node.get_name()}")))
     assert said == [f"two_publishers: {names} publish on /frames: their frames alternate"]
     inputs.close()
-    driver.destroy_node()
-    context.try_shutdown()
