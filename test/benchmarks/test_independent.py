@@ -2,15 +2,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """The second simulator against SciPy's rotations, OpenCV's lens, and finite differences."""
 
+import re
+import sys
 from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import benchmarks.independent
+from benchmarks.frames.conditions import Condition, moving
+from benchmarks.frames.judged import judge
 from benchmarks.independent import motions, rotations
 from benchmarks.independent.cameras import Camera, Scan
+from benchmarks.independent.frames import simulate
+from benchmarks.independent.motions import rest
+from benchmarks.independent.scenes import Board, Rich
 
 STEP = 1e-5
 
@@ -92,3 +101,33 @@ def test_every_point_is_seen_when_its_row_is_exposed(scan):
     np.testing.assert_allclose(camera.project(local_at(delay)), pixels, atol=1e-8)
     still = camera.project(local_at(np.zeros(60)))
     assert np.abs(still - pixels).max() > 1.0
+
+
+def test_a_bent_board_is_flat_in_its_map_only():
+    flat, bent = (simulate(Camera(), rest, Board(bend=bend), 5, 1, 0) for bend in (0.0, 0.002))
+    np.testing.assert_array_equal(flat.points, bent.points)
+    moved = np.linalg.norm(flat.exact - bent.exact, axis=-1)
+    sides = [0, 8, 45, 53]  # corners of the 9 x 6 grid
+    assert moved[:, sides].max() < 1e-9
+    assert moved.max() > 0.05
+
+
+@pytest.mark.parametrize("scan", list(Scan))
+def test_the_estimator_finds_the_truth_of_exact_pixels(scan):
+    # Steady motion, which every version of the estimator models: signs, axes and moments agree.
+    motion = moving("steady", rate=1.5, speed=0.7)
+    condition = Condition("exact", "any", motion, Rich(), 0.0, camera=Camera(scan=scan))
+    found = judge(condition, 4, 0, {})
+    assert found.localized.all()
+    for name, most in {"deg_s": 2e-3, "deg": 2e-3, "mm": 0.1, "deg/s": 0.3, "m/s": 0.01}.items():
+        assert found.of(name).max() < most, name
+
+
+def test_nothing_of_the_package_is_imported():
+    """What judges the estimator must not be made of it."""
+    files = sorted(Path(benchmarks.independent.__file__).parent.glob("*.py"))
+    assert len(files) > 4
+    for path in files:
+        for name in re.findall(r"^ *(?:from|import) ([.\w]+)", path.read_text(), re.MULTILINE):
+            fine = name.split(".")[0] in {"numpy", "scipy", *sys.stdlib_module_names}
+            assert fine or name.startswith("benchmarks.independent"), f"{path.name} imports {name}"
