@@ -53,10 +53,7 @@ def test_wrong_arguments_are_answered_in_a_line(path):
     ("name", "words", "package", "remedy"),
     [
         ("to_gsplat", "seen.parquet out", "pyarrow", "pip install pyarrow"),
-        ("to_rerun", "seen.parquet out", "rerun", "pip install rerun-sdk"),
-        ("hloc_queries", "a b c d e f 0.03", "h5py", "pip install h5py"),
         ("hloc_queries", "a b c d e f 0.03", "pycolmap", "pip install pycolmap"),
-        ("03_node_client", "", "rclpy", "pip install 'rs_localizer[ros]'"),
         ("px4_odometry", "ned", "rclpy", "pip install 'rs_localizer[ros]'"),
         ("px4_odometry", "ned", "px4_msgs", "PX4's release"),
     ],

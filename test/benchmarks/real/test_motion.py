@@ -77,10 +77,3 @@ def test_rows_see_the_room_when_they_are_exposed_and_the_judge_knows_the_truth(f
         assert min(rows[name].inside) > 0.75
     assert rows["30 ms ahead"].errors[0, 0] < 0.5 * rows["30 ms ahead, held"].errors[0, 0]
     assert motions.table(rows).text().count("\n") == len(rows)
-
-
-def test_shaking_has_the_size_that_was_asked_for(folder):
-    moving, _ = motions.read_aria(folder)
-    shaking, times = motions.shaken(moving, 0.2), np.arange(0.1, 0.8, 0.001)
-    beside = shaking.turns(times, 1) - moving.turns(times, 1)
-    assert np.sqrt(np.mean(np.sum(beside**2, axis=1))) == pytest.approx(0.2, rel=0.15)
