@@ -1,5 +1,7 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
+from contextlib import nullcontext
+
 import cv2
 import numpy as np
 import pytest
@@ -31,22 +33,23 @@ def pixels(count=200, seed=0):
     return np.random.default_rng(seed).uniform([0, 0], [639, 479], (count, 2))
 
 
-def test_width_and_height_that_are_exchanged():
-    K = np.array([[500.0, 0.0, 319.5], [0.0, 510.0, 239.5], [0.0, 0.0, 1.0]])
-    with pytest.raises(ValueError, match="of 640x480, not of 480x640: are width and height exch"):
-        Camera(480, 640, K)
-    # Of a lens that is turned with its image, and of one that is mounted beside the middle.
-    Camera(480, 640, [[500.0, 0, 239.5], [0, 510, 319.5], [0, 0, 1]])
-    Camera(480, 640, [[500.0, 0, 319.5], [0, 510, 300.0], [0, 0, 1]])
-
-
-def test_a_matrix_in_widths_of_the_image_is_named():
-    with pytest.raises(ValueError, match=r"not in pixels: focal lengths 0\.78, 1\.04, .* by 640"):
-        Camera(640, 480, [[0.78, 0, 0.5], [0, 1.04, 0.5], [0, 0, 1]])
-    Camera(640, 480, [[0.78 * 640, 0, 0.5 * 640], [0, 1.04 * 480, 0.5 * 480], [0, 0, 1]])
-    # A wide lens on a small image, and one whose corner is in the middle of its view.
-    Camera(16, 16, [[5.0, 0, 7.5], [0, 5, 7.5], [0, 0, 1]])
-    Camera(640, 480, [[500.0, 0, 0.5], [0, 500, 0.5], [0, 0, 1]])
+@pytest.mark.parametrize(
+    ("size", "K", "said"),
+    [
+        ((480, 640), (500.0, 510.0, 319.5, 239.5),
+         "of 640x480, not of 480x640: are width and height exch"),
+        ((480, 640), (500.0, 510.0, 239.5, 319.5), ""),  # a lens that is turned with its image
+        ((480, 640), (500.0, 510.0, 319.5, 300.0), ""),  # one that is mounted beside the middle
+        ((640, 480), (0.78, 1.04, 0.5, 0.5), r"not in pixels: focal lengths 0\.78, 1\.04, "),
+        ((16, 16), (5.0, 5.0, 7.5, 7.5), ""),  # a wide lens on a small image
+        ((640, 480), (500.0, 500.0, 0.5, 0.5), ""),  # a corner in the middle of the view
+        ((70_000, 480), (500.0, 500.0, 35_000.0, 240.0), "at most 65536 pixels wide and high, got"),
+    ],
+)  # fmt: skip
+def test_a_matrix_of_another_image_is_named(size, K, said):
+    fx, fy, cx, cy = K
+    with pytest.raises(ValueError, match=said) if said else nullcontext():
+        Camera(*size, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
 @pytest.mark.parametrize(("model", "D"), LENSES)
@@ -120,18 +123,19 @@ def test_what_has_no_bearing_has_none_and_harms_no_neighbour():
     assert np.isnan(camera().project(np.array([[0.0, 0.0, -1.0], [0.1, 0.0, 0.0]]))).all()
 
 
-def test_row_time_runs_from_first_to_last_exposed_pixel():
+@pytest.mark.parametrize(
+    ("direction", "expected"),
+    [
+        ("top_to_bottom", [-0.5, -0.5, 0.5, 0.5]),
+        ("bottom_to_top", [0.5, 0.5, -0.5, -0.5]),
+        ("left_to_right", [-0.5, 0.5, -0.5, 0.5]),
+        ("right_to_left", [0.5, -0.5, 0.5, -0.5]),
+    ],
+)
+def test_row_time_runs_from_first_to_last_exposed_pixel(direction, expected):
     corners = np.array([[0, 0], [639, 0], [0, 479], [639, 479]], float)
-    expected = {
-        "top_to_bottom": [-0.5, -0.5, 0.5, 0.5],
-        "bottom_to_top": [0.5, 0.5, -0.5, -0.5],
-        "left_to_right": [-0.5, 0.5, -0.5, 0.5],
-        "right_to_left": [0.5, -0.5, 0.5, -0.5],
-    }
-    for direction in DIRECTIONS:
-        np.testing.assert_allclose(
-            camera(scan_direction=direction).row_time(corners), expected[direction], atol=1e-15
-        )
+    found = camera(scan_direction=direction).row_time(corners)
+    np.testing.assert_allclose(found, expected, atol=1e-15)
 
 
 @pytest.mark.parametrize("direction", DIRECTIONS)

@@ -163,11 +163,8 @@ def test_threads_change_nothing_but_the_time(minimal, name, one_rotation):
     ("changes", "said"),
     [
         ({"points": np.zeros((2, 5, 3))}, r"takes points \(h,6,3\).* got \(2, 5, 3\)"),
-        ({"rays": np.zeros((2, 6, 3))}, r"rays \(h,6,2\)"),
-        ({"tau": np.zeros((1, 6))}, r"tau \(h,6\)"),
         ({"rotation": np.eye(4)}, r"rotation must be \(3,3\) or \(2,3,3\), got \(4, 4\)"),
         ({"iterations": 0}, "iterations must be 1 or more, got 0"),
-        ({"threads": -1}, "threads must be 0 .* got -1"),
         ({"bound": 1.0}, "bound is that of r6p, above 0"),
     ],
 )
