@@ -57,23 +57,10 @@ def test_poses_are_those_of_detect_and_replay(kind: str, walls: Path, tmp_path: 
         np.testing.assert_array_equal(*rows)
 
 
-@pytest.mark.parametrize(
-    ("name", "text"),
-    [("film.mp4", "is a video"), ("one.PNG", "is an image"), ("folder", "is a folder of 2 images")],
-)
-def test_images_need_a_map(tmp_path, capsys, name, text):
-    path = tmp_path / name
-    if not path.suffix:
-        path.mkdir()
-    for file in [path] if path.suffix else [path / "1.jpg", path / "2.jpg"]:
-        file.touch()
-    assert main(["replay", str(path)]) == 1
-    said = f"{path} {text}, not matches: give --map, of markers or landmarks, and --camera"
-    assert said in capsys.readouterr().err
-
-
 def test_what_is_missing_is_said(walls: Path, tmp_path: Path, capsys: Any) -> None:
     words = ["replay", str(walls.parent / "walls.mp4"), "--out", str(tmp_path / "out"), "--map"]
     assert main([*words, str(walls / "marker_map.yaml")]) == 2
     assert "a video or folder has no camera_info: give --camera" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+    assert main(["replay", str(walls.parent / "walls.mp4")]) == 1
+    assert "walls.mp4 is a video, not matches: give --map, of markers" in capsys.readouterr().err
