@@ -95,20 +95,6 @@ def test_an_even_motion_determines_nothing(rig, tmp_path, capsys):
     assert not (tmp_path / "rig.yaml").exists()
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (["video.mp4"], "--rig needs the recordings of several cameras, or one bag"),
-        (["a/cam.mp4", "b/cam.mp4"], "cameras need different names"),
-        (["1.mp4", "b.mp4"], "names that begin with a letter: 1, b"),
-        (["a.mp4", "b.mp4", "--imu"], "--imu is for one camera"),
-    ],
-)
-def test_what_is_no_rig(words, expected, capsys):
-    assert main(["calibrate", "--rig", *words]) == 2
-    assert expected in capsys.readouterr().err
-
-
 def test_faults_are_named_before_anything_is_read(pair, tmp_path, capsys):
     missing, lens = tmp_path / "rear.mp4", tmp_path / "lens_rear.yaml"
     lens.touch()

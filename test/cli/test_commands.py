@@ -100,6 +100,10 @@ for words in {[name.split() for name in COMMANDS]}:
         (["replay", "bag", "-p", "sead:=1"], "'sead' is not a setting"),
         (["replay", "a", "b"], "many recordings need --out DIR"),
         (["simulate", "x", "--rig", "c.yaml", "--imu"], "--rig goes without --imu"),
+        (["calibrate", "--rig", "video.mp4"], "--rig needs the recordings of several cameras, or"),
+        (["calibrate", "--rig", "a/cam.mp4", "b/cam.mp4"], "cameras need different names"),
+        (["calibrate", "--rig", "1.mp4", "b.mp4"], "names that begin with a letter: 1, b"),
+        (["calibrate", "--rig", "a.mp4", "b.mp4", "--imu"], "--imu is for one camera"),
     ],
 )
 def test_wrong_usage(words, text, capsys):

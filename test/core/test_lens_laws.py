@@ -56,13 +56,6 @@ def test_derivatives_are_finite_differences(model):
         np.testing.assert_allclose(projected.by_coefficients[:, :, k], slope, atol=1e-4)
 
 
-@pytest.mark.parametrize("model", DistortionModel)
-def test_rays_come_back_from_their_pixels(model):
-    for count in model.law.counts:
-        camera = Camera(640, 480, K, coefficients(model)[:count], model)
-        np.testing.assert_allclose(camera.rays(camera.distort(RAYS)[0]), RAYS, atol=1e-6)
-
-
 def khomutenko(x, y, z, alpha, beta):
     """Equation 12 of the paper."""
     rho = math.sqrt(z * z + beta * (x * x + y * y))

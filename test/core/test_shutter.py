@@ -37,22 +37,6 @@ def centre(motion, tau):
     return -rotation.T @ translation
 
 
-@pytest.mark.parametrize("acceleration", [0.0, 0.5])
-def test_velocities_are_the_derivatives_of_the_camera_s_path_in_its_own_axes(acceleration):
-    motion, h = some_motion(acceleration=acceleration), 1e-6
-    for tau in (-0.5, 0.0, 0.4):
-        map_from_camera = motion.at(tau)[0].T
-        velocity = (centre(motion, tau + h) - centre(motion, tau - h)) / (2 * h)
-        np.testing.assert_allclose(
-            map_from_camera.T @ velocity, motion.linear_velocity_at(tau), atol=1e-8
-        )
-        turn = motion.at(tau - h)[0] @ motion.at(tau + h)[0].T  # before_from_after
-        rate = Rotation.from_matrix(turn).as_rotvec() / (2 * h)
-        np.testing.assert_allclose(rate, motion.angular_velocity_at(tau), atol=1e-7)
-        if acceleration == 0.0:
-            np.testing.assert_allclose(rate, motion.angular_velocity, atol=1e-7)
-
-
 def test_accelerations_are_the_second_derivatives_at_the_middle_row():
     motion, h = some_motion(acceleration=0.5), 1e-4
     bent = (centre(motion, h) - 2 * centre(motion, 0.0) + centre(motion, -h)) / h**2

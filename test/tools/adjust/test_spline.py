@@ -42,19 +42,6 @@ def test_rates_are_derivatives_of_the_pose(turn):
     )
 
 
-def test_a_constant_turn_and_a_straight_line_are_kept():
-    rate, velocity = np.array([0.3, -2.0, 1.0]), np.array([1.0, 0.2, -0.5])
-    layout = Layout.over(np.array([[0.0, 1.0]]), 0.05)
-    times = layout.control_times()
-    spline = Spline(layout, so3.exp_many(times[:, None] * rate), times[:, None] * velocity)
-    t = np.linspace(0.0, 1.0, 7)
-    states = spline.states(t)
-    np.testing.assert_allclose(states.rotations, so3.exp_many(t[:, None] * rate), atol=1e-12)
-    np.testing.assert_allclose(states.positions, t[:, None] * velocity, atol=1e-12)
-    np.testing.assert_allclose(states.angular, np.tile(rate, (7, 1)), atol=1e-12)
-    np.testing.assert_allclose(states.angular_acceleration, 0.0, atol=1e-9)
-
-
 @pytest.mark.parametrize("turn", [0.0, 1e-6, 0.2, 1.0])
 def test_jacobians_are_finite_differences(turn):
     rng = np.random.default_rng(2)
