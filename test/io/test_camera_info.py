@@ -55,8 +55,6 @@ def test_binning_and_region(make_camera_info):
     ("changes", "text"),
     [
         ({"k": np.zeros(9)}, r"not calibrated: K\[0\] is 0"),
-        ({"k": np.ones(6)}, "K must have 9 values, found 6"),
-        ({"width": 0}, "image size must be given, found 0 x 480"),
         ({"distortion_model": "fisheye624"}, "must be one of plumb_bob, .*; found 'fisheye624'"),
         ({"roi": roi(600, 0, 100, 480)}, r"100 x 480 at \(600, 0\), does not lie in .*640 x 480"),
         ({"header": SimpleNamespace(frame_id="")}, "must name the camera's optical frame"),
