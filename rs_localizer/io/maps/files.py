@@ -4,11 +4,9 @@
 
 NumPy archives hold ``points`` (n,3) and what else is known: ``ids`` (n,), ``descriptors`` (n,d),
 ``covariances`` (n,3,3; m^2, NaN: not known) and ``error_modes`` (n,3,k; m). Nothing in them is
-ever unpickled, and nothing is allocated before the headers of the arrays, the sizes in the archive
-and the size of the file agree.
+ever unpickled.
 """
 
-import math
 import struct
 import tokenize
 import warnings
@@ -25,17 +23,15 @@ from rs_localizer.io.maps.landmarks import Map, MapError, make_map
 
 SUFFIX = ".npz"
 _ARRAYS = ("points", "ids", "descriptors", "covariances", "error_modes")
-# Limit of all arrays together, as floats of 8 bytes: for example ten million landmarks with 128
-# bytes.
+# Limit of all arrays together: for example ten million landmarks with 128 bytes.
 _MOST_BYTES = 2 * 2**30
 # Maps hold measured numbers, which deflate packs no better than this beside some bytes of zeros.
 _BEST_PACKING, _ZEROS = 20, 2**25
-_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_LONGEST_HEADER = 10_000
 # Exceptions that zipfile, zlib and NumPy raise for damaged files.
 _DAMAGES = (
     zipfile.BadZipFile, zlib.error, struct.error, EOFError, NotImplementedError, RuntimeError,
     ValueError, KeyError, OverflowError, SyntaxError, TypeError, OSError, tokenize.TokenError,
+    MemoryError,
 )  # fmt: skip
 
 
@@ -53,18 +49,16 @@ def read_npz(path: Path, frame: str) -> Map:
 def _arrays(file: IO[bytes]) -> dict[str, NDArray[Any]]:
     try:
         with zipfile.ZipFile(file) as archive:
-            members = {info.filename: info for info in archive.infolist()}
-            wanted = [members[f"{name}.npy"] for name in _ARRAYS if f"{name}.npy" in members]
-            if "points.npy" not in members:
-                names = ", ".join(sorted(members)[:10]) or "none"
+            sizes = np.array([(it.compress_size, it.file_size) for it in archive.infolist()])
+        packed, size = sizes.reshape(-1, 2).sum(axis=0).tolist()
+        if size > (most := min(_MOST_BYTES, _BEST_PACKING * packed + _ZEROS)):
+            raise MapError(f"the arrays are larger than {most / 1e6:.0f} MB: no measured map is")
+        file.seek(0)
+        with np.load(file) as archive:  # never unpickled
+            if "points" not in archive:
+                names = ", ".join(sorted(archive)[:10]) or "none"
                 raise MapError(f"the archive has no array 'points'; found {names}")
-            packed = sum(info.compress_size for info in wanted)
-            most = min(_MOST_BYTES, _BEST_PACKING * packed + _ZEROS)
-            if sum(_checked(archive, info) for info in wanted) > most:
-                raise MapError(
-                    f"the arrays are larger than {most / 1e6:.0f} MB: no measured map is"
-                )
-            return {info.filename[:-4]: _read(archive, info) for info in wanted}
+            return {name: np.asarray(archive[name]) for name in _ARRAYS if name in archive}
     except MapError:
         raise
     except _DAMAGES as error:
@@ -77,45 +71,6 @@ def write_npz(path: Path, landmarks: Map) -> None:
     arrays = {name: getattr(landmarks, name) for name in _ARRAYS}
     with path.open("wb") as file:  # given a name, NumPy would append a suffix
         np.savez(file, **{name: array for name, array in arrays.items() if array is not None})
-
-
-def _checked(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> int:
-    """Return the bytes that an array takes, if its header and its size in the archive agree."""
-    name = info.filename
-    if info.compress_type not in _COMPRESSIONS:
-        raise MapError(f"{name} is packed by method {info.compress_type}, which NumPy never uses")
-    with archive.open(info) as file:
-        header, count, itemsize = _size(file, name)
-    if header + count * itemsize != info.file_size:
-        raise MapError(
-            f"{name}: its shape takes {header + count * itemsize} bytes, found {info.file_size}"
-        )
-    return count * (itemsize if name == "descriptors.npy" else max(8, itemsize))
-
-
-def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
-    with archive.open(info) as file:
-        array: NDArray[Any] = np.lib.format.read_array(
-            file, allow_pickle=False, max_header_size=_LONGEST_HEADER
-        )
-    return array
-
-
-def _size(file: IO[bytes], name: str) -> tuple[int, int, int]:
-    """Return bytes of a member's header, and the count and the bytes of its numbers."""
-    version = np.lib.format.read_magic(file)
-    readers = {
-        (1, 0): np.lib.format.read_array_header_1_0,
-        (2, 0): np.lib.format.read_array_header_2_0,
-    }
-    if version not in readers:
-        raise MapError(f"{name} has version {version[0]}.{version[1]} of the format")
-    shape, _, kind = readers[version](file, max_header_size=_LONGEST_HEADER)
-    if kind.hasobject or kind.kind not in "fiu":
-        raise MapError(f"{name} must hold numbers, found {kind}")
-    if min(shape, default=0) < 0:
-        raise MapError(f"{name} has the shape {shape}")
-    return file.tell(), math.prod(shape), kind.itemsize  # Python integers do not overflow
 
 
 def read_map_file(path: Path | str, frame: str, database: Path | None = None) -> Map:
