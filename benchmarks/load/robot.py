@@ -105,7 +105,7 @@ class Drive:
         """The camera."""
         since = 1e-9 * (stamp_ns - self.start_ns) + np.asarray(offsets, float)
         bodies = [self.body(t) for t in since]
-        camera = BODY_FROM_CAMERA["forward_left_up"]
+        camera = BODY_FROM_CAMERA
         rate = camera.T @ np.array([0.0, 0.0, self.speed / self.radius])
         return TrueState(
             np.array([each.rotation @ camera for each in bodies]),
@@ -202,7 +202,7 @@ class _Around:
 
     def play(self, frames: Sequence[SimulatedFrame]) -> None:
         """Drive."""
-        camera = BODY_FROM_CAMERA["forward_left_up"], np.array([0.0, 0.0, self._drive.height])
+        camera = BODY_FROM_CAMERA, np.array([0.0, 0.0, self._drive.height])
         self._fixed.sendTransform(_stamped(0, "base_link", CAMERA_FRAME, Transform(*camera)))
         while not (self._infos.get_subscription_count() and self._clouds.get_subscription_count()):
             self._executor.spin_once(timeout_sec=0.1)

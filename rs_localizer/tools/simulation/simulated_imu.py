@@ -96,7 +96,7 @@ class Lever:
     """Where the IMU sits: a reading in its axes, ``rotation @ reading`` in the camera's."""
 
     rotation: Array = field(  # (3,3) camera_from_imu; REP-103's body, x forward and z up
-        default_factory=lambda: BODY_FROM_CAMERA["forward_left_up"].T
+        default_factory=BODY_FROM_CAMERA.T.copy
     )
     position: Array = field(  # (3,) m, in camera axes
         default_factory=lambda: np.array([0.03, -0.02, -0.01])

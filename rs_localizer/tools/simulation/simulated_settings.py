@@ -6,13 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# Camera axes (x right, y down, z forward) in the body axes of a recorded trajectory; columns are
-# the camera's axes. Motion capture of a rig or robot mostly gives REP-103's body, x forward and
-# z up; of a camera data set, the camera itself.
-BODY_FROM_CAMERA = {
-    "forward_left_up": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
-    "optical": np.eye(3),
-}
+BODY_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Camera axes (x right, y down, z forward) in those of REP-103's body, x forward and z up."""
 
 
 @dataclass(frozen=True, slots=True)

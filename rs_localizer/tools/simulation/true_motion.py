@@ -21,7 +21,7 @@ from rs_localizer.tools.simulation.simulated_settings import BODY_FROM_CAMERA
 # Motion capture at 100 Hz and more shakes by a few tenths of a degree from sample to sample: a
 # spline through every sample turns that into accelerations that no hand has (0.24 degrees median,
 # 8 at worst, off constant velocity in 30 ms on TUM VI room5; 0.04 and 0.27 with knots of 50 ms).
-KNOT_SPACING = 0.05
+_KNOT_SPACING = 0.05
 # Fewer samples to a knot than this leave nothing to average: then every sample is a knot.
 _SAMPLES_PER_KNOT = 2.0
 _DEGREE = 3
@@ -69,7 +69,7 @@ class ConstantVelocity:
     linear_velocity: Array  # (3,) m/s, along the camera's axes at the start
     duration: float  # s
     rotation: Array = field(  # map_from_camera at the start
-        default_factory=lambda: BODY_FROM_CAMERA["forward_left_up"]
+        default_factory=BODY_FROM_CAMERA.copy
     )
     position: Array = field(default_factory=lambda: np.zeros(3))
     start_ns: int = 0
@@ -96,27 +96,17 @@ class RecordedMotion:
     The truth is the spline itself, with its exact derivatives; the samples only shape it.
 
     Args:
-        trajectory: map_from_body.
-        axes: a key of BODY_FROM_CAMERA.
-        knot_spacing: s between the knots of a least-squares spline; 0: through every sample
-            (see KNOT_SPACING).
+        trajectory: map_from_body, of REP-103's body.
 
     Raises:
         ValueError: when no stretch is long enough for a spline.
     """
 
-    def __init__(
-        self,
-        trajectory: Trajectory,
-        axes: str = "forward_left_up",
-        knot_spacing: float = KNOT_SPACING,
-    ) -> None:
-        self._body_from_camera = BODY_FROM_CAMERA[axes]
+    def __init__(self, trajectory: Trajectory) -> None:
         spacings = np.diff(trajectory.stamps_ns) * 1e-9
-        if knot_spacing < _SAMPLES_PER_KNOT * (np.median(spacings) if len(spacings) else 0.0):
-            knot_spacing = 0.0
+        coarse = _SAMPLES_PER_KNOT * (np.median(spacings) if len(spacings) else 0.0) > _KNOT_SPACING
         self._stretches = [
-            _Stretch(part, knot_spacing)
+            _Stretch(part, 0.0 if coarse else _KNOT_SPACING)
             for part in split_at_gaps(trajectory)
             if len(part) > _DEGREE + 1
         ]
@@ -133,7 +123,7 @@ class RecordedMotion:
     def state(self, stamp_ns: int, offsets: Array) -> TrueState:
         starts = [stretch.start_ns for stretch in self._stretches]
         index = max(int(np.searchsorted(starts, stamp_ns, side="right")) - 1, 0)
-        return self._stretches[index].state(stamp_ns, offsets, self._body_from_camera)
+        return self._stretches[index].state(stamp_ns, offsets)
 
 
 class _Stretch:
@@ -147,12 +137,12 @@ class _Stretch:
         self._spline = _spline(t, values, knot_spacing)
         self._rate = self._spline.derivative()
 
-    def state(self, stamp_ns: int, offsets: Array, body_from_camera: Array) -> TrueState:
+    def state(self, stamp_ns: int, offsets: Array) -> TrueState:
         t = (stamp_ns - self.start_ns) * 1e-9 + np.asarray(offsets, float)
         values, rates = self._spline(t), self._rate(t)
         norms = np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
         q, q_rate = values[:, 3:] / norms, rates[:, 3:] / norms
-        rotations = Rotation.from_quat(q).as_matrix() @ body_from_camera
+        rotations = Rotation.from_quat(q).as_matrix() @ BODY_FROM_CAMERA
         # Body rate: the vector part of 2 conj(q) dq/dt; a change of the norm has none.
         body_rate = 2.0 * (
             q[:, 3:] * q_rate[:, :3] - q_rate[:, 3:] * q[:, :3] - np.cross(q[:, :3], q_rate[:, :3])
@@ -160,7 +150,7 @@ class _Stretch:
         return TrueState(
             rotations,
             values[:, :3],
-            body_rate @ body_from_camera,
+            body_rate @ BODY_FROM_CAMERA,
             np.einsum("nji,nj->ni", rotations, rates[:, :3]),
         )
 
