@@ -23,11 +23,10 @@ from rs_localizer.cli.typed import typed
 from rs_localizer.io.topics import CAMERA_INFO, IMAGE, IMU
 
 if WORKING:
-    import numpy as np
     from tqdm import tqdm
 
     from rs_localizer.config import CalibrationErrors, DetectorConfig, NodeConfig
-    from rs_localizer.core.camera import Camera, DistortionModel
+    from rs_localizer.core.camera import Camera
     from rs_localizer.io import rigs
     from rs_localizer.io.bags import BagReader, is_bag, open_bag
     from rs_localizer.io.camera_files import lens_parameters, write_calibration
@@ -339,7 +338,7 @@ def _calibrate_rig(args: Options) -> dict[str, Figures]:
         source = _read(own, replace(config, scan_direction=axis))
         intrinsics |= source.find_lens
         maps += [] if source.map is None else [source.map]
-        camera = _without_k3(replace(source.camera, scan_direction=axis))
+        camera = replace(source.camera, scan_direction=axis)
         recordings[name] = Recording(camera, _calibrated(own, source, camera, config))
     said = {name: verdict.refusal(each.calibration) for name, each in recordings.items()}
     if refusals := [f"{name}: {text}" for name, text in said.items() if text]:
@@ -364,13 +363,6 @@ def _calibrate_rig(args: Options) -> dict[str, Figures]:
         when = "next" if shutil.which("ros2") else "next, in a ROS 2 workspace"
         print(f"{when}: {shlex.join(['ros2', 'launch', str(place)])}")
     return {name: _figures(each.calibration) for name, each in recordings.items()}
-
-
-def _without_k3(camera: Camera) -> Camera:
-    """Return the camera with Kalibr's four coefficients, if the lens does not need a fifth."""
-    if camera.distortion_model != DistortionModel.PLUMB_BOB or np.any(camera.D[4:]):
-        return camera
-    return replace(camera, D=np.r_[camera.D, np.zeros(4)][:4])
 
 
 def _parts(

@@ -66,7 +66,7 @@ class Calibration:
 
 
 def read_camera_info(message: Any) -> Calibration:
-    """Read a CameraInfo of ROS 2 (``k``, ``d``) or ROS 1 (``K``, ``D``).
+    """Read a sensor_msgs/CameraInfo.
 
     Binning 0 means 1, and a region of interest of zeros the whole image, as the message says.
 
@@ -74,9 +74,7 @@ def read_camera_info(message: Any) -> Calibration:
         MessageError: for an impossible camera, saying what was found.
     """
     frame = frame_id(message, "the camera's optical frame")
-    ros1 = hasattr(message, "K")
-    K = tuple(float(value) for value in (message.K if ros1 else message.k))
-    D = tuple(float(value) for value in (message.D if ros1 else message.d))
+    K, D = (tuple(map(float, values)) for values in (message.k, message.d))
     width, height = int(message.width), int(message.height)
     if width == 0 or height == 0:
         raise MessageError(f"the image size must be given, found {width} x {height}")

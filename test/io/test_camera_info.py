@@ -27,14 +27,6 @@ def test_a_plain_camera(make_camera_info):
     assert (camera.binning, camera.roi) == ((1, 1), None)
 
 
-def test_ros1_has_capitals(make_camera_info):
-    message = make_camera_info()
-    ros2 = read_camera_info(message)
-    for name in "dkrp":
-        setattr(message, name.upper(), vars(message).pop(name))
-    assert read_camera_info(message) == ros2
-
-
 @pytest.mark.parametrize("coefficients", [[], [0.0] * 5])
 def test_no_model_and_no_distortion_is_plumb_bob(make_camera_info, coefficients):
     message = make_camera_info(distortion_model="", d=np.array(coefficients))

@@ -35,7 +35,7 @@ if WORKING:
     from rs_localizer.settings import build, write_camera_file
     from rs_localizer.tools.mapping.anchors import Anchors, Distance, PointSight
     from rs_localizer.tools.mapping.build import Built, Given, Workshop, build_map
-    from rs_localizer.tools.mapping.report import advice, rows, written
+    from rs_localizer.tools.mapping.report import advice, rows
     from rs_localizer.tools.mapping.seen_images import Looked, Looker, look_through
     from rs_localizer.tools.mapping.structure import Effort, require
 
@@ -69,7 +69,7 @@ def look_at_images(args: Options, points: Sequence[_Point], looker: Looker) -> L
 
 
 _Point = tuple[str, float, float, float]
-COLMAP, POSES, REPORT = "colmap", "poses.txt", "report.md"
+COLMAP, POSES = "colmap", "poses.txt"
 # A hand's motion is held by this many images a second.
 _IMAGES_PER_SECOND = 15.0
 
@@ -162,7 +162,6 @@ def _write(out: Path, built: Built, looked: Looked) -> None:
     write_camera_file(out / CAMERA, shutter, lens_parameters(camera) if whole else {})
     stamps, positions, quaternions = built.middle_rows([view.stamp_ns for view in looked.views])
     write_tum(out / POSES, Trajectory(stamps, positions, quaternions), ["of the middle rows"])
-    (out / REPORT).write_text(written(built, looked.images, looked.views), encoding="utf-8")
 
 
 def _print_result(args: Options, built: Built, looked: Looked) -> None:

@@ -95,14 +95,6 @@ def comes_back(seen: MapObservations) -> bool:
     return len(np.intersect1d(first, last)) >= _AGAIN * min(len(first), len(last))
 
 
-def written(built: Built, images: int, views: Sequence[SeenImage]) -> str:
-    """Return the report as a page of Markdown."""
-    table = "\n".join(f"| {name} | {text} |" for name, text in rows(built, images, len(views)))
-    film = "".join(f"* {text}\n" for text in advice(built, views))
-    film = f"\nTo film otherwise:\n\n{film}" if film else ""
-    return f"# Map\n\n| | |\n|---|---|\n{table}\n{film}"
-
-
 def _of_shutter(built: Built) -> list[tuple[str, str]]:
     fit, known = built.shutter, built.camera.readout_time
     if fit is None:
