@@ -30,12 +30,12 @@ from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.prints import Marker
 from rs_localizer.tools.mapping.anchors import Anchors
-from rs_localizer.tools.mapping.build import Built, Given, Workshop, built_from
+from rs_localizer.tools.mapping.build import Built, Given, built_from
 from rs_localizer.tools.mapping.gauge import scaled, through
 from rs_localizer.tools.mapping.map_keypoints import MapFreedom, MapObservations, Start
 from rs_localizer.tools.mapping.refinement import refine
 from rs_localizer.tools.mapping.seen_images import SeenImage
-from rs_localizer.tools.mapping.structure import Effort, Structure
+from rs_localizer.tools.mapping.structure import Structure
 from rs_localizer.tools.mapping.survey import Survey, survey
 from rs_localizer.tools.mapping.unknown_markers import Filmed, Spotted, every_marker
 from rs_localizer.tracking import FrameContext, Tracker
@@ -366,8 +366,10 @@ def _built(film: Film, room: Array, markers: int, rng: np.random.Generator) -> B
     inputs = Given(views, camera, anchors, _READOUT, str(camera.scan_direction))
     descriptors = np.zeros((len(room), 1), np.float32)
     structure = Structure(rows, seen, start, descriptors, camera, (count,), 0.0)
-    work = Workshop(nothing, Effort(), lambda name, total: nullcontext(lambda steps: None))
-    return built_from(inputs, structure, (rows, seen, start), camera, work)
+    return built_from(
+        inputs, structure, (rows, seen, start), camera,
+        lambda name, total: nullcontext(lambda steps: None),
+    )  # fmt: skip
 
 
 def _localized(

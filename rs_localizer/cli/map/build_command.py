@@ -34,10 +34,10 @@ if WORKING:
     from rs_localizer.io.trajectories import Trajectory, write_tum
     from rs_localizer.settings import build, write_camera_file
     from rs_localizer.tools.mapping.anchors import Anchors, Distance, PointSight
-    from rs_localizer.tools.mapping.build import Built, Given, Workshop, build_map
+    from rs_localizer.tools.mapping.build import Built, Given, build_map
     from rs_localizer.tools.mapping.report import advice, rows
     from rs_localizer.tools.mapping.seen_images import Looked, Looker, look_through
-    from rs_localizer.tools.mapping.structure import Effort, require
+    from rs_localizer.tools.mapping.structure import require
 
 
 def shutter_of(args: Options) -> tuple[float | None, str | None]:
@@ -110,7 +110,7 @@ def run(args: Options) -> None:
             inputs = Given(looked.views, looked.camera, anchors, *shutter, frame)
             folder = out / COLMAP
             folder.mkdir()
-            built = build_map(inputs, Workshop(folder, Effort(), stage))
+            built = build_map(inputs, folder, stage)
         _write(out, built, looked)
     _print_result(args, built, looked)
 

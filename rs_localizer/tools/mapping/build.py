@@ -32,7 +32,7 @@ from rs_localizer.tools.mapping.anchors import (
     placement,
 )
 from rs_localizer.tools.mapping.gauge import Similarity, laid_on_held, scaled
-from rs_localizer.tools.mapping.map_keypoints import MapObservations, Start, adjusted_part
+from rs_localizer.tools.mapping.map_keypoints import ADJUSTED, MapObservations, Start, adjusted_part
 from rs_localizer.tools.mapping.refinement import DRIFT, RefinedMap
 from rs_localizer.tools.mapping.seen_images import (
     LEAST_VIEWS,
@@ -46,7 +46,7 @@ from rs_localizer.tools.mapping.shutter_fit import (
     likely_axis,
     refine_with_shutter,
 )
-from rs_localizer.tools.mapping.structure import Effort, Stage, Structure, build_structure
+from rs_localizer.tools.mapping.structure import Stage, Structure, build_structure
 from rs_localizer.tools.mapping.track_on_map import track_on_map
 from rs_localizer.tools.mapping.triangulation import Sights, Triangulated, moves, triangulate
 from rs_localizer.tools.readout_belief import ReadoutCheck, ShutterFit
@@ -77,15 +77,6 @@ class Given:
     @property
     def stamps_ns(self) -> IntArray:
         return np.array([view.stamp_ns for view in self.views], np.int64)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Workshop:
-    """Place and manner of the work."""
-
-    folder: Path  # for COLMAP's files, which stay
-    effort: Effort
-    stage: Stage  # of each part: its name and number of steps in; what counts them comes out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,29 +135,34 @@ class Built:
         return times, self.positions, Rotation.from_matrix(self.rotations).as_quat()
 
 
-def build_map(inputs: Given, work: Workshop) -> Built:
+def build_map(inputs: Given, folder: Path, stage: Stage) -> Built:
     """Build a map.
+
+    Args:
+        inputs: the images, and what is known of them.
+        folder: for COLMAP's files, which stay.
+        stage: of each part: its name and number of steps in; what counts them comes out.
 
     Raises:
         ValueError: when the images make no map, saying what was found.
     """
     check_views(inputs.views)
     keyframes = choose_keyframes(inputs.views)
-    structure = _structure(inputs, keyframes, work)
+    structure = _structure(inputs, keyframes, folder, stage)
     camera = replace(
         structure.camera,
         readout_time=inputs.readout_time or 0.0,
         scan_direction=likely_axis(structure.camera.size, inputs.scan_direction),
     )
-    with work.stage("track", len(inputs.views)) as step:
+    with stage("track", len(inputs.views)) as step:
         tracked = track_on_map(inputs.views, structure, camera, lambda: step(1))
-    built = built_from(inputs, structure, tracked, camera, work)
+    built = built_from(inputs, structure, tracked, camera, stage)
     return replace(built, keyframes=keyframes)
 
 
 def built_from(
     inputs: Given, structure: Structure, tracked: tuple[IntArray, MapObservations, Start],
-    camera: Camera, work: Workshop,
+    camera: Camera, stage: Stage,
 ) -> Built:  # fmt: skip
     """Build a map from a first structure.
 
@@ -178,8 +174,8 @@ def built_from(
         ValueError: when the images make no map, saying what was found.
     """
     rows, shown, start = tracked
-    used, adjusted, near = adjusted_part(shown, start, work.effort.adjusted)
-    refined, shutter, check = _refined(inputs, adjusted, near, camera, work)
+    used, adjusted, near = adjusted_part(shown, start, ADJUSTED)
+    refined, shutter, check = _refined(inputs, adjusted, near, camera, stage)
     estimated = None if inputs.camera is not None else structure.camera.focal_length
     check_fit(refined.fit_share, estimated)
     motion = ViewMotion(rows[used], refined.times, refined)
@@ -215,12 +211,10 @@ def built_from(
     )  # fmt: skip
 
 
-def _structure(inputs: Given, keyframes: IntArray, work: Workshop) -> Structure:
+def _structure(inputs: Given, keyframes: IntArray, folder: Path, stage: Stage) -> Structure:
     """Return the first structure, of about the right size."""
     stamps = {row: inputs.views[row].stamp_ns for row in keyframes.tolist()}
-    structure = build_structure(
-        inputs.views[0].image.parent, stamps, inputs.camera, work.folder, work.effort, work.stage,
-    )  # fmt: skip
+    structure = build_structure(inputs.views[0].image.parent, stamps, inputs.camera, folder, stage)
     total = len(keyframes)
     if structure.parts[0] < max(LEAST_VIEWS, _LEAST_PART * total):
         listed = " and ".join(map(str, structure.parts))
@@ -238,7 +232,7 @@ def usual_size(seen: MapObservations, start: Start) -> Similarity:
 
 
 def _refined(
-    inputs: Given, observations: MapObservations, start: Start, camera: Camera, work: Workshop
+    inputs: Given, observations: MapObservations, start: Start, camera: Camera, stage: Stage
 ) -> tuple[RefinedMap, ShutterFit | None, ReadoutCheck | None]:
     """Return the refined map, a shutter that was unknown or wrong, the check of a given one."""
     freedom = replace(colmap_freedom(inputs.camera is None), drifts=_MODES)
@@ -250,7 +244,7 @@ def _refined(
         )
         freedom = replace(freedom, deviations=deviations)
     given = inputs.readout_time
-    with work.stage("refine", 3 if given is not None else 6) as step:
+    with stage("refine", 3 if given is not None else 6) as step:
         return refine_with_shutter(camera, observations, start, freedom, given, lambda _: step(1))
 
 

@@ -22,7 +22,7 @@ from rs_localizer.io.maps.colmap import Model, ModelImage, Points
 from rs_localizer.tools.adjust.reprojection import LIMIT
 from rs_localizer.tools.mapping import MappingError
 from rs_localizer.tools.mapping.build import ViewMotion, usual_size
-from rs_localizer.tools.mapping.map_keypoints import LEAST_KEYPOINTS, adjusted_part
+from rs_localizer.tools.mapping.map_keypoints import ADJUSTED, LEAST_KEYPOINTS, adjusted_part
 from rs_localizer.tools.mapping.refinement import RefinedMap
 from rs_localizer.tools.mapping.shutter_fit import (
     colmap_freedom,
@@ -30,7 +30,7 @@ from rs_localizer.tools.mapping.shutter_fit import (
     likely_axis,
     refine_with_shutter,
 )
-from rs_localizer.tools.mapping.structure import HALF, Effort, observed
+from rs_localizer.tools.mapping.structure import HALF, observed
 from rs_localizer.tools.mapping.triangulation import triangulate
 from rs_localizer.tools.readout_belief import ReadoutCheck, ShutterFit
 
@@ -76,7 +76,7 @@ def undo_shutter(
     seen, given = observed(model, names, stamps)
     size = usual_size(seen, given)
     start, scale = given.moved(size), size.scale
-    used, some, near = adjusted_part(seen, start, Effort().adjusted, LEAST_KEYPOINTS)
+    used, some, near = adjusted_part(seen, start, ADJUSTED, LEAST_KEYPOINTS)
     if not len(used):
         raise MappingError(
             f"no image of the model shows {LEAST_KEYPOINTS} points that three images see"

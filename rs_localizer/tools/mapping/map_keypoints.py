@@ -28,8 +28,9 @@ from rs_localizer.tools.readout_belief import ReadoutCheck
 _LEAST_IMAGES, _LEAST_SHARED = 3, 3
 # Fewer observations hold a landmark on one ray, nearly.
 _LEAST_OBSERVATIONS = 3
-# An image with fewer keypoints does not know where it is.
-LEAST_KEYPOINTS = 6
+# An image with fewer keypoints does not know where it is; more than so many of it say little more,
+# and cost time.
+LEAST_KEYPOINTS, ADJUSTED = 6, 150
 
 
 def middle_row_delay(camera: Camera, stamp_offset: float) -> float:

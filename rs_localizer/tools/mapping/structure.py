@@ -40,6 +40,10 @@ _SCRIPT = Path(__file__).with_name("structure_process.py")
 # later (its sequential matching), and every n-th with every n-th, this many of them: loops close
 # there.
 _EXHAUSTIVE, _OVERLAP = 30, 10
+# Features of an image. COLMAP's default of 8192 takes sixteen times as long to match as 2048: 213 s
+# of CPU in all on half of 103 images of 800x600. With more than one thread of its mapping, the last
+# digits vary.
+_FEATURES, _THREADS, _SEED = 2000, 1, 0
 # COLMAP has the corner of the first pixel at 0, 0; here that is its centre.
 HALF = 0.5
 
@@ -59,19 +63,6 @@ class Structure:
     error: float  # px, mean reprojection error of COLMAP's model
 
 
-@dataclass(frozen=True, slots=True)
-class Effort:
-    """How much work is done, and how."""
-
-    threads: int = 1  # of COLMAP's mapping; with more than one, the last digits vary
-    seed: int = 0
-    # Features of an image. COLMAP's default of 8192 takes sixteen times as long to match as 2048:
-    # 213 s of CPU in all on half of 103 images of 800x600.
-    features: int = 2000
-    # Keypoints of a view that are adjusted: more say little more, and cost time.
-    adjusted: int = 150
-
-
 def require() -> None:
     """Raise ImportError where pycolmap is not installed, before any work is done."""
     # It is not imported here: see the process of its own.
@@ -85,8 +76,7 @@ def image_name(row: int) -> str:
 
 
 def build_structure(
-    images: Path, keyframes: Mapping[int, int], lens: Camera | None, folder: Path, effort: Effort,
-    stage: Stage,
+    images: Path, keyframes: Mapping[int, int], lens: Camera | None, folder: Path, stage: Stage
 ) -> Structure:  # fmt: skip
     """Reconstruct the largest connected part of the keyframes.
 
@@ -95,7 +85,6 @@ def build_structure(
         keyframes: rows of the views, and their stamps, ns.
         lens: of all images, which is believed; None: COLMAP calibrates a simple radial camera.
         folder: for COLMAP's database and model; they stay.
-        effort: threads and seed.
         stage: a context for each part of the work: its name and number of steps in, what counts
             them out.
 
@@ -108,9 +97,9 @@ def build_structure(
         "names": [image_name(row) for row in keyframes],
         "pairs": pairs_of(len(keyframes)),
         "camera": None if lens is None else colmap_parameters(lens),
-        "features": effort.features,
-        "seed": effort.seed,
-        "threads": effort.threads,
+        "features": _FEATURES,
+        "seed": _SEED,
+        "threads": _THREADS,
     }
     (folder / _TASK).write_text(json.dumps(task), encoding="utf-8")
     said = _run(folder / _TASK, stage)

@@ -16,7 +16,7 @@ from rs_localizer.io.camera_files import colmap_camera, colmap_parameters
 from rs_localizer.tools.mapping import MappingError
 from rs_localizer.tools.mapping import structure as structures
 from rs_localizer.tools.mapping.shutter_fit import global_errors
-from rs_localizer.tools.mapping.structure import Effort, build_structure, image_name, pairs_of
+from rs_localizer.tools.mapping.structure import build_structure, image_name, pairs_of
 from rs_localizer.tools.simulation.walls import collage
 
 K = np.array([[260.0, 0.0, 161.0], [0.0, 255.0, 118.0], [0.0, 0.0, 1.0]])
@@ -57,7 +57,7 @@ def build(images: Path, folder: Path, count: int) -> structures.Structure:
     folder.mkdir()
     rows = {k: k for k in range(count)}
     silent = lambda *_: nullcontext(lambda count: None)  # noqa: E731
-    return build_structure(images, rows, None, folder, Effort(), silent)
+    return build_structure(images, rows, None, folder, silent)
 
 
 def test_a_process_that_dies_is_named(tmp_path, monkeypatch):
