@@ -226,23 +226,34 @@ def _transitions(innovation: float) -> Array:
     ])  # fmt: skip
 
 
-@entry
-def likeness(points: Array2, numbers: Array1, neighbours: int) -> float:
+def likeness(points: Array, numbers: Array, neighbours: int) -> float:
     """Return the mean product of numbers (n,) of points (n,3) and of their neighbours."""
+    widest = int(np.ptp(points, axis=0).argmax())
+    order = points[:, widest].argsort()
+    found: float = _likeness(points[order], numbers[order], neighbours, widest)
+    return found
+
+
+@entry
+def _likeness(points: Array2, numbers: Array1, neighbours: int, sorted_by: int) -> float:
     count, total = len(points), 0.0
     far, near = np.empty(neighbours), np.empty(neighbours)
     for i in range(count):
         far[:] = np.inf
-        for j in range(count):
-            square = 0.0
-            for axis in range(3):
-                square += (points[i, axis] - points[j, axis]) ** 2
-            if j == i or not square < far[neighbours - 1]:
-                continue
-            place = neighbours - 1
-            while place > 0 and square < far[place - 1]:
-                far[place], near[place] = far[place - 1], near[place - 1]
-                place -= 1
-            far[place], near[place] = square, numbers[j]
+        for step in (-1, 1):  # both ways, until all others are farther along that axis alone
+            j = i + step
+            while 0 <= j < count:
+                if not (points[i, sorted_by] - points[j, sorted_by]) ** 2 < far[neighbours - 1]:
+                    break
+                square = 0.0
+                for axis in range(3):
+                    square += (points[i, axis] - points[j, axis]) ** 2
+                if square < far[neighbours - 1]:
+                    place = neighbours - 1
+                    while place > 0 and square < far[place - 1]:
+                        far[place], near[place] = far[place - 1], near[place - 1]
+                        place -= 1
+                    far[place], near[place] = square, numbers[j]
+                j += step
         total += numbers[i] * near.sum()
     return total / (count * neighbours)

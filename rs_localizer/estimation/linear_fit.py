@@ -66,6 +66,8 @@ MIDDLE = np.zeros((PARAMETERS, TURNS))
 """How the coefficients of the in-frame turn turn the middle row, and how fast."""
 _VALUES, _RATES = MIDDLE_VALUES @ COMBINATIONS, MIDDLE_RATES @ COMBINATIONS
 MIDDLE[TURN], MIDDLE[ANGULAR] = np.kron(_VALUES, np.eye(3)), np.kron(_RATES, np.eye(3))
+# Places of the unknowns among columns that are sorted by axis.
+_BY_COMBINATION = np.r_[:PARAMETERS, PARAMETERS + np.arange(TURNS).reshape(3, RESOLVED).T.ravel()]
 
 _CENTRES, _WIDTH, _FLOOR = (0.75, 1.5, 3.0, 5.0), 0.4, 0.03
 _BANDS = np.exp(-0.5 * (np.log(CYCLES[None] / np.array(_CENTRES)[:, None]) / _WIDTH) ** 2) + _FLOOR
@@ -90,7 +92,9 @@ _LEAST_PART, _MOST_PART = 0.16, 1.3
 # Least share of the equations that columns leave to measure the noise with.
 _LEAST_FREEDOM = 0.1
 # Logarithm of the odds below which larger sizes are not looked at, and a size has no part.
-_HOPELESS, _NO_PART = 12.0, 1e-3
+_HOPELESS, _NO_PART = 9.0, 1e-3
+# Points whose columns are multiplied at a time.
+_PART = 64
 
 
 class TurnPrior(NamedTuple):
@@ -175,33 +179,33 @@ def linear_of(lines: Lines, chosen: BoolArray1, turns: bool, rows: Array2) -> Li
         turns: with the block of the in-frame turn.
         rows: (2m,q) of what points share.
     """
-    size = PARAMETERS + (TURNS if turns else 0)
-    columns, place = np.empty((len(rows), size + 1)), 0
-    values, rates = np.empty(FUNCTIONS), np.empty(FUNCTIONS)
-    for i in range(len(chosen)):
-        if not chosen[i]:
-            continue
+    size, picked = PARAMETERS + (TURNS if turns else 0), np.flatnonzero(chosen)
+    every, beside = np.zeros((size + 1, size + 1)), np.zeros((rows.shape[1], size + 1))
+    columns = np.empty((2 * min(_PART, len(picked)), size + 1))
+    values, rates = np.zeros((_PART, FUNCTIONS)), np.empty(FUNCTIONS)
+    for first in range(0, len(picked), _PART):  # whose columns stay in the processor's cache
+        some = picked[first : first + _PART]
         if turns:
-            shake_basis(lines.tau[i], values, rates)
-        each = values @ COMBINATIONS if turns else values
-        for side in range(2):
-            row, motion, by_turn = columns[place], lines.by_motion[i, side], lines.by_turn[i, side]
-            for k in range(PARAMETERS):
-                row[k] = motion[k]
-            row[size] = lines.errors[i, side]
-            if turns:
-                for axis in range(3):
-                    value, rate, beside = motion[axis], motion[6 + axis], by_turn[axis]
+            for i in range(len(some)):
+                shake_basis(lines.tau[some[i]], values[i], rates)
+        each, part = values @ COMBINATIONS, columns[: 2 * len(some)]
+        for i in range(len(some)):
+            for side in range(2):
+                motion = lines.by_motion[some[i], side]
+                row, by_turn = part[2 * i + side], lines.by_turn[some[i], side]
+                row[:PARAMETERS], row[size] = motion, lines.errors[some[i], side]
+                for axis in range(3 if turns else 0):  # behind each other, as vectors want it
+                    value, rate, swing = motion[axis], motion[6 + axis], by_turn[axis]
+                    place = row[PARAMETERS + RESOLVED * axis :]
                     for j in range(RESOLVED):
-                        row[PARAMETERS + 3 * j + axis] = (
-                            each[j] * beside + _VALUES[j] * value + _RATES[j] * rate
-                        )
-            place += 1
-    every, beside = columns.T @ columns, rows.T @ columns
-    return Linear(
-        every[:size, :size].copy(), every[:size, size].copy(), every[size, size],
-        beside[:, :size].copy(), beside[:, size].copy(),
-    )  # fmt: skip
+                        place[j] = each[i, j] * swing + _VALUES[j] * value + _RATES[j] * rate
+        every += part.T @ part
+        beside += rows[2 * first : 2 * (first + len(some))].T @ part
+    own, along, shown = every[:size, :size], every[:size, size].copy(), beside[:, :size]
+    if turns:
+        order = _BY_COMBINATION
+        own, along, shown = own[order][:, order], along[order], shown[:, order]
+    return Linear(own.copy(), along, every[size, size], shown.copy(), beside[:, size].copy())
 
 
 def without(linear: Linear, name: str) -> Linear:
@@ -371,16 +375,28 @@ def _factor(own: Array, along: Array, information: Array, factor: float, equatio
         for j in range(size):
             row[j] = shown[j] + weight * known[j]
         row[size], least[i] = along[i], max(_ROUNDING * row[i], TINY)
-    for k in range(size):
-        row = equations[k, k:]
-        scale = 1.0 / math.sqrt(max(row[0], least[k]))
-        for j in range(len(row)):
-            row[j] *= scale
-        for i in range(k + 1, size):
+    for k in range(0, size, 2):  # two at a time: each row is read and written half as often
+        first = equations[k, k:]
+        _scaled(first, least[k])
+        if k + 1 == size:
+            break
+        second, beside, part = equations[k + 1, k + 1 :], first[1:], first[1]
+        for j in range(len(second)):
+            second[j] -= part * beside[j]
+        _scaled(second, least[k + 1])
+        for i in range(k + 2, size):
             # Loops over slices from zero are what the compiler makes vectors of.
-            other, beside, part = equations[i, i:], row[i - k :], row[i - k]
+            other, beside, beneath = equations[i, i:], first[i - k :], second[i - k - 1 :]
+            part, more = beside[0], beneath[0]
             for j in range(len(other)):
-                other[j] -= part * beside[j]
+                other[j] -= part * beside[j] + more * beneath[j]
+
+
+@kernel
+def _scaled(row: Array, least: float) -> None:
+    scale = 1.0 / math.sqrt(max(row[0], least))
+    for j in range(len(row)):
+        row[j] *= scale
 
 
 @kernel
@@ -431,22 +447,29 @@ def _over_turns(
     nothing = np.zeros(size), np.zeros((size, size)), -np.inf, 1.0, weights
     if not (np.all(np.isfinite(own)) and np.all(np.isfinite(along)) and np.isfinite(rest)):
         return nothing
+    # What a turn of any size explains.
+    _factor(own, along, prior.informations[0], np.inf, wholes[0])
+    free = max(1.0 - np.sum(wholes[0, :, size] ** 2) / rest, _LEAST_LEFT)
+    ceiling = -0.5 * freedom * math.log(free)
     for s in range(spectra):
+        volume = 0.0
         for f in range(factors):
             if prior.odds[s, f] == -np.inf:
                 continue
+            is_less = f and prior.odds[s, f] < prior.odds[s, f - 1]
+            if is_less and prior.odds[s, f] + volume + ceiling < best - _HOPELESS:
+                break
             whole = wholes[s * factors + f]
             _factor(own, along, prior.informations[s], prior.factors[f], whole)
             _back(whole, means[s, f])
-            explained, volume = 0.0, -size * math.log(prior.factors[f])
+            explained, volume = 0.0, prior.volumes[s] - size * math.log(prior.factors[f])
             for k in range(size):
                 explained += whole[k, size] ** 2
                 volume -= math.log(whole[k, k])
             left[s, f] = max(1.0 - explained / rest, _LEAST_LEFT)
-            weights[s, f] = prior.odds[s, f] + prior.volumes[s] + volume
-            weights[s, f] -= 0.5 * freedom * math.log(left[s, f])
+            weights[s, f] = prior.odds[s, f] + volume - 0.5 * freedom * math.log(left[s, f])
             best = max(best, weights[s, f])
-            if f and weights[s, f] < best - _HOPELESS and prior.odds[s, f] < prior.odds[s, f - 1]:
+            if is_less and weights[s, f] < best - _HOPELESS:
                 break
     if not best > -np.inf:
         return nothing

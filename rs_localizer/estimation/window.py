@@ -69,6 +69,8 @@ _FORGETTING = 0.8
 _DOUBT = 5.0
 # How much variances may change in a round, and rounds: by a hundred within two frames.
 _LEAST_CHANGE, _MOST_CHANGE, _ROUNDS = 0.2, 25.0, 2
+# Deviations that a round changes by less than this logarithm have settled.
+_SETTLED = 0.1
 # Of the configured deviations: a tripod's, and that of a blow.
 _LEAST_SCALE, _MOST_SCALE = 0.03, 100.0
 # Who turns about one axis turns a little about the others: of the largest deviation.
@@ -327,7 +329,7 @@ def _solve(
     predictions, transports, knowns = np.empty(square), np.empty(square), np.empty(square)
     covariances, spreads = np.empty(square), np.empty(square)
     filtered[0], covariances[0], surprise = start, start_covariance, 0.0
-    for left in range(rounds, -1, -1):
+    while True:
         for k in range(count):
             predicted[k], predictions[k], transports[k] = _predicted(
                 filtered[k], covariances[k], seconds[k], deviations, readout_share, FADING
@@ -353,12 +355,15 @@ def _solve(
             smoothed[k] = apply_step(filtered[k], gain @ step)
             whole = covariances[k] + gain @ (after - predictions[k]) @ gain.T
             spreads[k] = 0.5 * (whole + whole.T)
-        if left > 0:
-            ratios = 1.0 + (scores[:, 0] - scores[:, 1]) / (scores[:, 2] + _DOUBT)
-            deviations *= np.sqrt(np.minimum(np.maximum(ratios, _LEAST_CHANGE), _MOST_CHANGE))
-            least, most = _LEAST_SCALE * configured, _MOST_SCALE * configured
-            deviations = np.minimum(np.maximum(deviations, least), most)
-            deviations[:3] = np.maximum(deviations[:3], _LEAST_SHARE * deviations[:3].max())
+        if rounds == 0:
+            break
+        ratios = 1.0 + (scores[:, 0] - scores[:, 1]) / (scores[:, 2] + _DOUBT)
+        before, ratios = deviations, np.minimum(np.maximum(ratios, _LEAST_CHANGE), _MOST_CHANGE)
+        least, most = _LEAST_SCALE * configured, _MOST_SCALE * configured
+        deviations = np.minimum(np.maximum(before * np.sqrt(ratios), least), most)
+        deviations[:3] = np.maximum(deviations[:3], _LEAST_SHARE * deviations[:3].max())
+        is_settled = np.max(np.abs(np.log(deviations / before))) < _SETTLED
+        rounds = 0 if is_settled else rounds - 1
     return filtered, covariances, smoothed, spreads, deviations, surprise
 
 

@@ -42,6 +42,13 @@ ROUTINE int numba_xxgemm(char kind, char turn_a, char turn_b, Index m, Index n, 
     Matrix c = at(c_data, m, n, c_step);
     if (kept == 0.0) c.setZero();
     else if (kept != 1.0) c *= kept;
+    if (a_data == b_data && a_step == b_step && a_turned != b_turned && m == n && kept == 0.0 && !is_small) {
+        auto half = c.selfadjointView<Eigen::Lower>();  // of a matrix and itself: half of the work
+        if (a_turned) half.rankUpdate(a.transpose(), factor);
+        else half.rankUpdate(a, factor);
+        c.triangularView<Eigen::StrictlyUpper>() = c.transpose();
+        return 0;
+    }
     if (a_turned && b_turned) add_product(c, factor, a.transpose(), b.transpose(), is_small);
     else if (a_turned) add_product(c, factor, a.transpose(), b, is_small);
     else if (b_turned) add_product(c, factor, a, b.transpose(), is_small);
