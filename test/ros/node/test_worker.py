@@ -5,6 +5,7 @@
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import pytest
@@ -64,6 +65,18 @@ class Fake:
     def wait(self, semaphore: threading.Semaphore) -> None:
         assert semaphore.acquire(timeout=PATIENCE)
 
+    def begin(self, frame: str) -> None:
+        """Send a frame, which is then being worked on."""
+        self.send(frame)
+        self.wait(self.started)
+
+    def finish(self, frames: int, published: int) -> list[str]:
+        """Let so many frames be worked on, until so many are published: all that are."""
+        self.go_on.release(frames)
+        for _ in range(published):
+            self.wait(self.done)
+        return self.published
+
     def _localize(self, frame: Any) -> Any:
         if isinstance(frame, Iterator):
             return frame
@@ -89,14 +102,10 @@ def fake() -> Iterator[Fake]:
 
 
 def test_the_newest_frame_wins_and_what_it_replaced_is_counted(fake):
-    fake.send("one")
-    fake.wait(fake.started)
+    fake.begin("one")
     for frame in ("two", "three", "four"):
         fake.send(frame)
-    fake.go_on.release(2)
-    fake.wait(fake.done)
-    fake.wait(fake.done)
-    assert fake.published == ["one old", "four old"]
+    assert fake.finish(2, 2) == ["one old", "four old"]
     summary = fake.statistics.summary()
     assert summary.total == {"received": 4, "answered": 2, "replaced": 2}
 
@@ -104,35 +113,25 @@ def test_the_newest_frame_wins_and_what_it_replaced_is_counted(fake):
 def test_updates_come_before_the_next_frame_and_never_within_one(fake):
     order: list[str] = []
 
-    def settings(text: str) -> Any:
-        def change() -> None:
-            order.append(text)
-            fake.settings = text
+    def change(text: str) -> None:
+        order.append(text)
+        fake.settings = text
 
-        return change
-
-    fake.send("one")
-    fake.wait(fake.started)
+    fake.begin("one")
     fake.send("two")
-    fake.worker.update("settings", settings("newer"))
+    fake.worker.update("settings", partial(change, "newer"))
     fake.worker.update("camera", lambda: order.append("camera"))
-    fake.worker.update("settings", settings("newest"))
-    fake.go_on.release(2)
-    fake.wait(fake.done)
-    fake.wait(fake.done)
-    assert fake.published == ["one old", "two newest"]
+    fake.worker.update("settings", partial(change, "newest"))
+    assert fake.finish(2, 2) == ["one old", "two newest"]
     assert order == ["camera", "newest"]
 
 
 def test_nothing_is_published_after_a_pause(fake):
-    fake.send("one")
-    fake.wait(fake.started)
+    fake.begin("one")
     fake.send("two")
     fake.worker.pause()  # does not wait for the frame
     fake.send("three")
-    fake.go_on.release(2)
-    fake.wait(fake.done)
-    assert fake.published == ["three old"]
+    assert fake.finish(2, 1) == ["three old"]
     assert fake.statistics.summary().total["dropped"] == 2  # none is lost unseen
 
 
@@ -183,8 +182,7 @@ def test_a_pause_just_before_something_is_published_still_counts(fake):
 
 def test_a_worker_that_is_closed_publishes_nothing_more(fake):
     """Neither what it works on nor what comes."""
-    fake.send("one")
-    fake.wait(fake.started)
+    fake.begin("one")
     fake.worker.close()
     fake.go_on.release(10)
     assert wait_for_workers(PATIENCE)
@@ -206,22 +204,6 @@ def test_all_results_of_a_message_are_published_as_they_come(fake):
     assert (total["received"], total["answered"], total["refused"]) == (2, 4, 1)
 
 
-def test_what_a_frame_waited_for_wakes_the_worker(monkeypatch, fake):
-    monkeypatch.setattr(worker_module, "_LOOK_PERIOD", PATIENCE)  # it does not look by itself
-    fake.go_on.release()
-    fake.awaited = {"one"}
-    fake.send("one")
-    changed = threading.Semaphore(0)
-    fake.worker.update("settings", changed.release)
-    fake.wait(changed)
-    while not fake.worker._waiting:
-        time.sleep(0.001)
-    fake.awaited.clear()
-    fake.worker.look()
-    fake.wait(fake.done)
-    assert fake.published == ["one old"]
-
-
 def test_what_an_update_of_nobody_foresaw_is_told_and_the_next_is_done():
     told: list[str] = []
     done = threading.Semaphore(0)
@@ -239,18 +221,21 @@ def test_what_an_update_of_nobody_foresaw_is_told_and_the_next_is_done():
     assert "a bug" in told[0]
 
 
-def test_a_frame_waits_for_what_it_needs_but_not_for_long(fake):
-    fake.go_on.release(3)
+def test_a_frame_waits_for_what_it_needs_but_not_for_long(monkeypatch, fake):
+    monkeypatch.setattr(worker_module, "_LOOK_PERIOD", PATIENCE)  # it does not look by itself
     fake.awaited = {"one"}
     fake.send("one")
     fake.send("two", topic="others")  # those behind it wait, too
-    time.sleep(0.05)
+    changed = threading.Semaphore(0)
+    fake.worker.update("settings", changed.release)
+    fake.wait(changed)
+    while not fake.worker._waiting:
+        time.sleep(0.001)
     assert fake.published == []
     fake.awaited.clear()
     fake.worker.look()
-    fake.wait(fake.done)
-    fake.wait(fake.done)
+    assert fake.finish(2, 2) == ["one old", "two old"]
+    monkeypatch.undo()
     fake.awaited, fake.patience_of_frames = {"three"}, 0.05
     fake.send("three")
-    fake.wait(fake.done)
-    assert fake.published == ["one old", "two old", "three old"]
+    assert fake.finish(1, 1) == ["one old", "two old", "three old"]
