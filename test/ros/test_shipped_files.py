@@ -126,18 +126,15 @@ def declared(description: list[Piece]) -> dict[str, str]:
     return {k: str(v.installed) if isinstance(v, Piece) else v for k, v in values.items()}
 
 
-def node(description: list[Piece], executable: str) -> Piece:
-    (found,) = [
-        piece
-        for piece in description
-        if piece.kind == "Node" and piece.options["executable"] == executable
-    ]
-    return found
+def nodes(description: list[Piece], executable: str) -> list[dict[str, Any]]:
+    """Options of the nodes that are started."""
+    started = [piece.options for piece in description if piece.kind == "Node"]
+    return [options for options in started if options["executable"] == executable]
 
 
 def parameters(description: list[Piece], executable: str) -> dict[str, Any]:
     """What a node gets besides its params file."""
-    file, given = node(description, executable).options["parameters"]
+    ((file, given),) = (options["parameters"] for options in nodes(description, executable))
     assert Path(file).is_file()
     return {k: v.arguments[0] if isinstance(v, Piece) else v for k, v in given.items()}
 
@@ -156,17 +153,16 @@ def test_arguments_and_files_exist(describe, file):
     assert all(path.is_file() for path in shared)
     for piece in description:
         if piece.kind == "Node" and piece.options["package"] == "rs_localizer":
-            assert (
-                f"{piece.options['executable']} = rs_localizer." in (ROOT / "setup.py").read_text()
-            )
+            declared = f"{piece.options['executable']} = rs_localizer."
+            assert declared in (ROOT / "setup.py").read_text()
 
 
 def test_every_input_can_be_remapped(describe):
     inputs = set(LocalizerNode.topics(Mock(), NodeConfig())) | set(INPUTS)
     inputs -= {name for name in inputs if name.startswith("~/")}
-    launched = node(describe("localizer.launch.py"), "localizer")
-    assert {name for name, _ in launched.options["remappings"]} == inputs
-    assert launched.options["name"] == NODE_NAME
+    (launched,) = nodes(describe("localizer.launch.py"), "localizer")
+    assert {name for name, _ in launched["remappings"]} == inputs
+    assert launched["name"] == NODE_NAME
 
 
 @pytest.mark.parametrize("file", LOCALIZING)
@@ -175,15 +171,12 @@ def test_every_setting_can_be_given(describe, file):
     if file in DETECTORS:
         names |= set(settings(DETECTORS[file]))
     assert names | {"use_sim_time"} <= declared(describe(file, **MAP.get(file, {}))).keys()
-    given = {
-        "readout_time": "2e-2", "seed": "3", "tracking": "False", "map_frame": "1",
-        "use_sim_time": "true", "scan_direction": "bottom_to_top",
-    }  # fmt: skip
+    words = {"readout_time": ("2e-2", 0.02), "seed": ("3", 3), "tracking": ("False", False),
+             "map_frame": ("1", "1"), "use_sim_time": ("true", True),
+             "scan_direction": ("bottom_to_top", "bottom_to_top")}  # fmt: skip
+    given = {name: typed for name, (typed, _) in words.items()}
     found = parameters(describe(file, **MAP.get(file, {}), **given), "localizer")
-    assert found == {
-        "readout_time": 0.02, "seed": 3, "tracking": False, "map_frame": "1",
-        "use_sim_time": True, "scan_direction": "bottom_to_top",
-    }  # fmt: skip
+    assert found == {name: value for name, (_, value) in words.items()}
 
 
 def test_the_localizer_knows_how_well_a_board_is_known(describe, tmp_path):
@@ -232,15 +225,11 @@ def test_an_argument_that_there_is_not_ends_the_launch(describe, monkeypatch, ty
 
 def test_each_camera_of_a_rig_has_a_detector_in_its_namespace(describe):
     found = describe("rig.launch.py", cameras="[front, rear]", marker_map=WALL, namespace="robot")
-    detectors = [
-        piece.options
-        for piece in found
-        if piece.kind == "Node" and piece.options["executable"] == "marker_detector"
-    ]
+    detectors = nodes(found, "marker_detector")
     assert [options["namespace"] for options in detectors] == ["robot/front", "robot/rear"]
     for options in detectors:
         assert options["parameters"][1]["marker_map"].arguments == (WALL,)
-    launched = node(found, "localizer").options
+    (launched,) = nodes(found, "localizer")
     assert launched["parameters"][1]["cameras"] == ["front", "rear"]
 
 
@@ -260,27 +249,17 @@ def test_the_parameters_of_a_recording_hold_in_every_namespace(tmp_path, namespa
     assert load_params_file(tmp_path / PARAMETERS)["readout_time"] == 0.021
 
 
-def test_rviz_shows_what_the_node_publishes():
+def test_viewers_show_what_the_nodes_publish():
     view = yaml.safe_load((ROOT / "config" / "rs_localizer.rviz").read_text())
-    displays = view["Visualization Manager"]["Displays"]
-    shown = {
-        item["Topic"]["Value"]: RVIZ[item["Class"].split("/")[1]]
-        for item in displays
-        if "Topic" in item
-    }
+    displays = [item for item in view["Visualization Manager"]["Displays"] if "Topic" in item]
+    shown = {item["Topic"]["Value"]: RVIZ[item["Class"].split("/")[1]] for item in displays}
     assert shown.items() <= SENT.items()
-    assert len(shown) == 8
-    assert "rviz_default_plugins/TF" in [item["Class"] for item in displays]
-
-
-def test_foxglove_shows_what_the_node_publishes():
     text = (ROOT / "config" / "rs_localizer.foxglove.json").read_text()
-    layout = json.loads(text)
     topics = set(re.findall(r'"/(\w+/\w+)', text))
-    assert len(topics) == 8
     assert topics <= set(SENT)
+    assert len(shown) == len(topics) == 8
     panels = re.findall(r'"(?:first|second)": "([^"]+)"', text)
-    assert sorted(panels) == sorted(layout["configById"])
+    assert sorted(panels) == sorted(json.loads(text)["configById"])
 
 
 def test_nav2_manages_the_node():
