@@ -4,7 +4,7 @@
 
 import re
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.recording import CAMERA_FRAME
+from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.ros.node.conversion import copy_message
 
 from . import robot as around
@@ -29,33 +30,17 @@ FLIGHT = (
     "--noise", "0.3", "--outliers", "0.1", "--imu",
 )  # fmt: skip
 # Numbers that survive any arithmetic: a camera at the front that looks to the left.
-MOUNTING = ("base_link", CAMERA_FRAME, (0.5, 0.25, 0.875), (-0.5, -0.5, 0.5, 0.5), 0)
+LEFT = Rotation.from_quat([-0.5, -0.5, 0.5, 0.5])
+MOUNTING = Transform(LEFT.as_matrix(), np.array([0.5, 0.25, 0.875]))
 # The node's inputs are best effort, and a busy machine loses messages: here, none may be lost.
 RELIABLE = [
     word
     for topic in KINDS
     for word in ("-p", f"qos_overrides.{topic}.subscription.reliability:=reliable")
 ]
-Sample = tuple[str, str, tuple[float, ...], tuple[float, ...], int]
 
 
-def stamped(make: Callable[..., Any], sample: Sample) -> Any:
-    parent, child, (x, y, z), (qx, qy, qz, qw), stamp_ns = sample
-    seconds, nanoseconds = divmod(stamp_ns, 10**9)
-    stamp = make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
-    return make(
-        "geometry_msgs/msg/TransformStamped",
-        header=make("std_msgs/msg/Header", stamp=stamp, frame_id=parent),
-        child_frame_id=child,
-        transform=make(
-            "geometry_msgs/msg/Transform",
-            translation=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-            rotation=make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
-        ),
-    )
-
-
-def true_odometry(truth: list[Any]) -> Iterator[Sample]:
+def true_odometry(truth: list[Any]) -> Iterator[tuple[int, Transform]]:
     """Odometry at 50 Hz, which rests before the flight and after it."""
     first_ns = stamp_ns(truth[0])
     times = np.array([1e-9 * (stamp_ns(message) - first_ns) for message in truth])
@@ -63,13 +48,11 @@ def true_odometry(truth: list[Any]) -> Iterator[Sample]:
     places = np.array([(place.x, place.y, place.z) for place in places])
     turns = [message.pose.orientation for message in truth]
     turns = Slerp(times, Rotation.from_quat([(q.x, q.y, q.z, q.w) for q in turns]))
-    lever, mounted = np.array(MOUNTING[2]), Rotation.from_quat(MOUNTING[3])
     for tick in range(-3, round(50.0 * times[-1]) + 5):
         time = min(max(0.02 * tick, 0.0), times[-1])
-        body = turns(time) * mounted.inv()
-        place = np.array([np.interp(time, times, row) for row in places.T]) - body.apply(lever)
-        stamp = first_ns + tick * 20_000_000
-        yield ("odom", "base_link", tuple(place.tolist()), tuple(body.as_quat().tolist()), stamp)
+        place = np.array([np.interp(time, times, row) for row in places.T])
+        camera = Transform(turns(time).as_matrix(), place)
+        yield first_ns + tick * 20_000_000, camera @ MOUNTING.inverse()
 
 
 def record(folder: Path) -> Path:
@@ -78,13 +61,15 @@ def record(folder: Path) -> Path:
     with open_bag(folder / "flight") as bag:
         items = list(bag.messages((*KINDS, "/tf_static")))
         truth = [message for _, _, message in bag.messages(("/truth/pose",))]
-    odometry = list(true_odometry(truth))
+    mounting = make_transform(make_message, 0, "base_link", CAMERA_FRAME, MOUNTING)
+    odometry = [
+        make_transform(make_message, stamp, "odom", "base_link", body)
+        for stamp, body in true_odometry(truth)
+    ]
     with BagWriter(folder / "robot") as bag:
-        for sample in (MOUNTING, *odometry):
-            topic = "/tf" if sample[-1] else "/tf_static"
-            transforms = [stamped(make_message, sample)]
-            message = make_message("tf2_msgs/msg/TFMessage", transforms=transforms)
-            bag.write(topic, message, items[0][1])
+        for item in (mounting, *odometry):
+            message = make_message("tf2_msgs/msg/TFMessage", transforms=[item])
+            bag.write("/tf_static" if item is mounting else "/tf", message, items[0][1])
         for topic, recorded_ns, message in items:
             bag.write(topic, message, recorded_ns)
     return folder / "robot"
