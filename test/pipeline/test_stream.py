@@ -4,6 +4,7 @@
 
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,17 +19,13 @@ class Heard:
     """A stream, and what it told."""
 
     def __init__(self) -> None:
-        self.notices: list[str] = []
-        self.texts: list[str] = []
-        self.forgotten = 0
-        self.stream = Stream(self._hear, self._forget)
+        self.told: list[tuple[str, str]] = []
+        self.forget = Mock()
+        self.stream = Stream(lambda *words: self.told.append(words), self.forget)
 
-    def _hear(self, name: str, text: str) -> None:
-        self.notices.append(name)
-        self.texts.append(text)
-
-    def _forget(self) -> None:
-        self.forgotten += 1
+    @property
+    def notices(self) -> list[str]:
+        return [name for name, _ in self.told]
 
     def reason(self, seconds: float, frame: str = "map") -> Any:
         refusal = self.stream.follow(round(seconds * SECOND), frame)
@@ -40,12 +37,12 @@ def test_stamps_out_of_order():
     assert [heard.reason(s) for s in (5.0, 5.1, 5.1, 5.05, 5.2, 4.71)] == [
         None, None, "repeated_stamp", "late_frame", None, "late_frame",
     ]  # fmt: skip
-    assert (heard.forgotten, heard.notices) == (0, [])
+    assert (heard.forget.call_count, heard.notices) == (0, [])
     # Half a second and more is a recording that starts over.
     assert heard.reason(4.7) is None
-    assert (heard.forgotten, heard.notices) == (1, ["time_went_back"])
+    assert (heard.forget.call_count, heard.notices) == (1, ["time_went_back"])
     assert heard.reason(4.7, "other") is None
-    assert (heard.forgotten, heard.notices[1:]) == (2, ["map_changed"])
+    assert (heard.forget.call_count, heard.notices[1:]) == (2, ["map_changed"])
     heard.stream.reset()
     assert heard.reason(4.7, "other") is None
 
@@ -55,7 +52,7 @@ def test_a_stamp_of_zero_is_none_and_ends_no_track():
     assert [heard.reason(s) for s in (5.0, 0.0, 5.1, 0.0, 5.1)] == [
         None, "no_stamp", None, "no_stamp", "repeated_stamp",
     ]  # fmt: skip
-    assert (heard.forgotten, heard.notices) == (0, [])
+    assert (heard.forget.call_count, heard.notices) == (0, [])
     # Of a recording that starts at 0 it is a time like any other.
     heard = Heard()
     heard.stream.zero_is_time = True
@@ -83,10 +80,11 @@ def test_a_map_in_millimetres_is_named(unit, speed, noise, told, to_and_fro):
         heard.stream.pace(i * SECOND // 30, estimate, points, NodeConfig())
     assert ("map_scale" in heard.notices) == told
     if told:
-        speeds = [float(text.split(" m/s")[0].split()[-1]) for text in heard.texts]
+        texts = [text for _, text in heard.told]
+        speeds = [float(text.split(" m/s")[0].split()[-1]) for text in texts]
         assert np.median(speeds) == pytest.approx(unit * speed, rel=0.25)
-        assert "2000 m from the points" in heard.texts[-1]
-        assert heard.texts[-1].endswith(
+        assert "2000 m from the points" in texts[-1]
+        assert texts[-1].endswith(
             "by a factor of 0.001 (map align --scale), these are "
             f"{1e-3 * speeds[-1]:.2g} m/s and 2 m"
         )
