@@ -26,7 +26,13 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.outputs import Localized, messages
-from rs_localizer.io.transforms import NotYetError, TransformError, TransformTree
+from rs_localizer.io.transforms import (
+    NotYetError,
+    Transform,
+    TransformError,
+    TransformTree,
+    make_transform,
+)
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.frames import ANY_CALIBRATION
@@ -61,21 +67,10 @@ CAMERA_FROM_BASE = np.linalg.inv(BASE_FROM_MAST @ MAST_FROM_CAMERA_LINK @ CAMERA
 
 
 def tf(parent: str, child: str, pose: Array, seconds: float = 0.0) -> SimpleNamespace:
-    """A TFMessage with one transform, written from its definition."""
-    x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
-    px, py, pz = pose[:3, 3].tolist()
-    stamp = round(seconds * 1e9)
-    stamped = SimpleNamespace(
-        header=SimpleNamespace(
-            stamp=SimpleNamespace(sec=stamp // 10**9, nanosec=stamp % 10**9), frame_id=parent
-        ),
-        child_frame_id=child,
-        transform=SimpleNamespace(
-            translation=SimpleNamespace(x=px, y=py, z=pz),
-            rotation=SimpleNamespace(x=x, y=y, z=z, w=w),
-        ),
-    )
-    return SimpleNamespace(transforms=[stamped])
+    """A TFMessage with one transform."""
+    transform = Transform(pose[:3, :3], pose[:3, 3])
+    item = make_transform(make_message, round(seconds * 1e9), parent, child, transform)
+    return SimpleNamespace(transforms=[item])
 
 
 @pytest.fixture
