@@ -96,31 +96,23 @@ def covariance(motion: Estimate, function: Callable[[Array], Array], step: float
 
 @pytest.mark.parametrize("tau", TAUS)
 @pytest.mark.parametrize("rate", RATES)
-def test_pose(rate, tau):
+def test_pose_and_its_rate_of_change(rate, tau):
     motion = estimate(rate, acceleration=0.2 * rate, shake=0.003)
     rotation, position = pose(motion, tau)
-    result = pose_at(motion, tau)
-    assert np.allclose(result.rotation, rotation, atol=1e-13)
-    assert np.allclose(result.position, position, atol=1e-13)
+    found, velocities = pose_at(motion, tau), twist_at(motion, tau, READOUT_TIME)
+    assert np.allclose(found.rotation, rotation, atol=1e-13)
+    assert np.allclose(found.position, position, atol=1e-13)
+    expected = twist(motion, tau)
+    assert np.allclose([*velocities.linear, *velocities.angular], expected, rtol=1e-6, atol=2e-6)
     motion = estimate(rate)
     expected = covariance(motion, lambda error: pose_error(motion, tau, error), 1e-5)
     assert np.allclose(pose_at(motion, tau).covariance, expected, rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.parametrize("tau", TAUS)
-@pytest.mark.parametrize("rate", RATES)
-def test_twist_is_the_rate_of_change_of_the_pose(rate, tau):
-    motion = estimate(rate, acceleration=0.2 * rate, shake=0.003)
-    result = twist_at(motion, tau, READOUT_TIME)
-    expected = twist(motion, tau)
-    assert np.allclose([*result.linear, *result.angular], expected, rtol=1e-6, atol=2e-6)
     # Far outside the readout there is no shaking.
-    motion = estimate(rate)
     joint = motion.joint_covariance[:18, :18]
     motion = replace(motion, shake=np.zeros((0, 3)), joint_covariance=joint)
     expected = covariance(motion, lambda error: twist(disturbed(motion, error), tau), 1e-4)
-    found = twist_at(motion, tau, READOUT_TIME).covariance
-    assert np.allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+    found = twist_at(motion, tau, READOUT_TIME)
+    assert np.allclose(found.covariance, expected, atol=1e-4 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("tau", [-0.5, 0.2, 0.5])
@@ -165,6 +157,13 @@ def test_an_uncertain_readout_time_enters_both_covariances():
         rtol=1e-3, atol=1e-9,
     )  # fmt: skip
 
+    # A camera at rest may have begun to move within the delay.
+    rest = replace(estimate(0.0), linear_velocity=np.zeros(3))
+    pose, twist = pose_at(rest, 0.0), twist_at(rest, 0.0, READOUT_TIME)
+    doubted, _ = with_timing(pose, twist, 0.0, 0.1, Acceleration(20.0, 5.0))
+    way = 0.5 * np.repeat([5.0, 20.0], 3) * 0.1**2
+    np.testing.assert_allclose(doubted.covariance - pose.covariance, np.diag(way**2), atol=1e-12)
+
 
 @pytest.mark.parametrize("tau", [-0.67, -2.5, 0.7])
 def test_nothing_runs_away_beyond_the_rows(tau):
@@ -185,15 +184,6 @@ def test_nothing_runs_away_beyond_the_rows(tau):
     found = twist_at(seen, tau, READOUT_TIME)
     assert np.abs(found.angular).max() < 0.5 / READOUT_TIME
     assert np.linalg.eigvalsh(found.covariance).min() > 0.0
-
-
-def test_a_camera_at_rest_may_have_begun_to_move_within_the_delay():
-    motion, delay = estimate(0.0), 0.1
-    motion = replace(motion, linear_velocity=np.zeros(3))
-    pose, twist = pose_at(motion, 0.0), twist_at(motion, 0.0, READOUT_TIME)
-    doubted, _ = with_timing(pose, twist, 0.0, delay, Acceleration(20.0, 5.0))
-    way = 0.5 * np.repeat([5.0, 20.0], 3) * delay**2
-    np.testing.assert_allclose(doubted.covariance - pose.covariance, np.diag(way**2), atol=1e-12)
 
 
 def test_what_no_row_has_seen_grows_with_the_distance():
