@@ -16,43 +16,16 @@ from scipy.stats import chi2
 import rs_localizer as rsl
 from rs_localizer.config import CalibrationErrors
 
+from .core.test_lens_laws import PAPERS, WIDE
+
 SIZE, FOCAL, READOUT = 800, 210.0, 0.03
 K = np.array([[FOCAL, 0.0, 399.5], [0.0, FOCAL, 399.5], [0.0, 0.0, 1.0]])
 WIDEST = math.radians(100.0)
 
 
-def kannala_brandt(points, k1, k2, k3, k4):
-    """Equation 6 of Kannala and Brandt (2006), the first coefficient in the focal length."""
-    angle = np.arccos(points[:, 2] / np.linalg.norm(points, axis=1))
-    radius = angle + k1 * angle**3 + k2 * angle**5 + k3 * angle**7 + k4 * angle**9
-    azimuth = np.arctan2(points[:, 1], points[:, 0])
-    return radius[:, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth)])
-
-
-def double_sphere(points, xi, alpha):
-    """Equation 40 of Usenko, Demmel, Cremers (2018)."""
-    z = xi * np.linalg.norm(points, axis=1) + points[:, 2]
-    across = np.hypot(points[:, 0], points[:, 1])
-    return points[:, :2] / (alpha * np.hypot(across, z) + (1.0 - alpha) * z)[:, None]
-
-
-def extended_unified(points, alpha, beta):
-    """Equation 12 of Khomutenko, Garcia, Martinet (2016)."""
-    across = beta * (points[:, 0] ** 2 + points[:, 1] ** 2)
-    rho = np.sqrt(across + points[:, 2] ** 2)
-    return points[:, :2] / (alpha * rho + (1.0 - alpha) * points[:, 2])[:, None]
-
-
-LENSES = {
-    "equidistant": (kannala_brandt, [0.01, -0.004, 0.002, -3e-4]),
-    "ds": (double_sphere, [-0.2, 0.59]),
-    "eucm": (extended_unified, [0.63, 1.05]),
-}
-
-
 def frame(rng, lens, count, noise, least=0.0):
     """Points (n,3) in the map, their pixels (n,2), and the true motion at the middle row."""
-    see, D = LENSES[lens]
+    D, _ = WIDE[lens]
     rotation, position = Rotation.random(random_state=rng), rng.uniform(-2.0, 2.0, 3)
     turn, speed = (of * rng.normal(size=3) / math.sqrt(3.0) for of in (1.2, 0.5))
     angle = np.arccos(rng.uniform(math.cos(WIDEST), math.cos(least), count))
@@ -64,7 +37,8 @@ def frame(rng, lens, count, noise, least=0.0):
     for _ in range(20):
         time = READOUT * (row / (SIZE - 1) - 0.5)
         body = rotation.inv().apply(points - position) - time[:, None] * speed
-        pixels = FOCAL * see(Rotation.from_rotvec(-time[:, None] * turn).apply(body), *D) + 399.5
+        local = Rotation.from_rotvec(-time[:, None] * turn).apply(body)
+        pixels = FOCAL * np.array([PAPERS[lens](*point, *D) for point in local]) + 399.5
         row = pixels[:, 1]
     pixels = pixels + noise * rng.normal(size=pixels.shape)
     shown = np.all((pixels > -0.5) & (pixels < SIZE - 0.5), axis=1)
@@ -83,10 +57,10 @@ def errors(result, motion):
 
 
 def camera(lens):
-    return rsl.Camera(SIZE, SIZE, K, LENSES[lens][1], lens, readout_time=READOUT)
+    return rsl.Camera(SIZE, SIZE, K, WIDE[lens][0], lens, readout_time=READOUT)
 
 
-@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("lens", WIDE)
 def test_points_beyond_90_degrees_are_as_good_as_others(lens):
     rng = np.random.default_rng(7)
     exact = rsl.LocalizerConfig(calibration=CalibrationErrors(0.0, 0.0, 0.0, 0.0))
