@@ -136,27 +136,6 @@ def test_a_prediction_says_which_of_both_poses_it_is(small_planes):
     assert helped > 5
 
 
-def test_a_track_begins_with_an_orientation_that_is_not_published(monkeypatch):
-    """Every frame adds what it knows, although the first ones know too little to be published."""
-    camera = rsl.Camera(1000, 1000, CAMERA.K, readout_time=0.03)
-    points, _, motion = plane_frame(3, 30.0, 0.0, 0.0, 0.3)
-    exact, _ = project_rolling(camera, motion.at_rows, points)
-    rng = np.random.default_rng(3)
-    frames = [exact + rng.normal(size=exact.shape) for _ in range(12)]
-    monkeypatch.setattr(acceptance, "MOST_TURN", 1.0)
-    alone = rsl.Localizer(camera).localize(points, frames[0])
-    most = alone.orientation_deviation / 3.2
-    monkeypatch.setattr(acceptance, "MOST_TURN", most)
-    tracker = rsl.Tracker(rsl.Localizer(camera))
-    results = [
-        tracker.localize(33_333_333 * (1 + k), points, frame) for k, frame in enumerate(frames)
-    ]
-    assert results[0].reason == "uncertain"
-    assert results[-1]
-    assert results[-1].tracked
-    assert results[-1].orientation_deviation <= 3.0 * most
-
-
 def test_tracked_plane_does_not_lock_in_on_a_lean():
     # Frames in a row agree on a lean that noise made: 59 % were inside, 5 % beyond five sigma. Half
     # of them know it well enough to be published.
