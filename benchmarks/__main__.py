@@ -55,7 +55,7 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   mapping                          refined maps and surveyed markers
   fuzzing                          wrong input for everything that reads
   load                             live nodes under load
-  load.robot                       a live node on a robot: occlusions, odometry at 200 Hz
+  load.robot                       a live node on a robot: occlusions, trouble
   page                             what a bench prints, into the docs
 """
 

@@ -332,15 +332,6 @@ def _chunk(kind: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
-def _animated_png() -> bytes:
-    """Two pictures, one after the other."""
-    png, pixels = _compressed(".png"), zlib.compress((b"\0" + bytes(8)) * 6)
-    control = [struct.pack(">5I2H2B", number, 8, 6, 0, 0, 1, 10, 0, 0) for number in (0, 1)]
-    first = _chunk(b"acTL", struct.pack(">II", 2, 0)) + _chunk(b"fcTL", control[0])
-    second = _chunk(b"fcTL", control[1]) + _chunk(b"fdAT", struct.pack(">I", 2) + pixels)
-    return png[:33] + first + _chunk(b"IDAT", pixels) + second + png[-12:]
-
-
 def _with_check_sums(png: bytes) -> bytes:
     """A damaged PNG whose chunks are whole again, as far as they can be told."""
     parts, position = [png[:8]], 8
@@ -513,7 +504,7 @@ def _packed(random: Random) -> bytes:
 
 @cache
 def _shown() -> list[bytes]:
-    return [_compressed(".png"), _compressed(".jpg"), _compressed(".tiff"), _animated_png()]
+    return [_compressed(".png"), _compressed(".jpg"), _compressed(".tiff")]
 
 
 def _pictures(random: Random) -> bytes:

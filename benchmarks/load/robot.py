@@ -4,7 +4,6 @@
 
     python -m benchmarks.load.robot occlusions     # four minutes
     python -m benchmarks.load.robot trouble        # five: wrong maps, kidnapping, clicks, a rival
-    python -m benchmarks.load.robot rate --rate 200
 
 A robot drives in circles at 0.5 m/s through a simulated room, in real time: 30 images a second
 (100 points, 0.7 px, 20 % wrong; they arrive 45 ms after their stamps), odometry at 50 Hz that
@@ -35,13 +34,12 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, PointCloud2
 
-from benchmarks.load.measuring import cpu_time, running
+from benchmarks.load.measuring import running
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -144,8 +142,6 @@ class Heard:
 
     looks: list[Looked] = field(default_factory=list)
     values: list[tuple[float, int, dict[str, str]]] = field(default_factory=list)  # level
-    odometry: list[tuple[int, float, Array]] = field(default_factory=list)  # stamp, heard, place
-    cpu: float = math.nan
 
 
 @contextlib.contextmanager
@@ -157,7 +153,7 @@ def _tf2_ros() -> Iterator[Any]:
     yield importlib.import_module("tf2_ros")
 
 
-def driven(trouble: Trouble, drift: tuple[float, float], **settings: Any) -> Heard:
+def driven(trouble: Trouble, drift: tuple[float, float]) -> Heard:
     """What is heard of a node on such a drive."""
     drive = Drive(trouble.seconds, trouble.carried)
     world = room(sampled_states(drive, 0.5).positions, np.random.default_rng(0), count=20_000)
@@ -166,8 +162,8 @@ def driven(trouble: Trouble, drift: tuple[float, float], **settings: Any) -> Hea
         "readout_time": CAMERA.readout_time, "base_frame": "base_link",
         "publish_tf": "map_to_odom",
     }  # fmt: skip
-    with _tf2_ros() as tf2, running(1, {**own, **settings}) as (peer, [(namespace, pid)]):
-        around = _Around((peer, namespace, pid), tf2, drive, drift, trouble)
+    with _tf2_ros() as tf2, running(1, own) as (peer, [(namespace, _)]):
+        around = _Around(peer, namespace, tf2, drive, drift, trouble)
         around.play(frames)
     return around.heard
 
@@ -176,7 +172,7 @@ class _Around:
     """What is around a live node: it sends, looks, and keeps what it hears."""
 
     def __init__(
-        self, live: tuple[Node, str, int], tf2: Any, drive: Drive, drift: tuple[float, float],
+        self, node: Node, space: str, tf2: Any, drive: Drive, drift: tuple[float, float],
         trouble: Trouble,
     ) -> None:  # fmt: skip
         self._drive, self._drift, self._trouble = drive, drift, trouble
@@ -185,7 +181,6 @@ class _Around:
         # Of ~/map_to_odom: stamp, turn, covariance.
         self._sure: deque[tuple[int, Array, Array]] = deque(maxlen=200)
         self._base_ns = 0
-        node, space, self._pid = live
         self._executor, own = SingleThreadedExecutor(), f"{space}/rs_localizer"
         self._executor.add_node(node)
         self._infos = node.create_publisher(CameraInfo, f"{space}/{CAMERA_INFO}", 10)
@@ -195,7 +190,6 @@ class _Around:
         self._buffer = tf2.Buffer()
         self.listener = tf2.TransformListener(self._buffer, node)
         kind = PoseWithCovarianceStamped
-        node.create_subscription(Odometry, f"{own}/odometry", self._take_odometry, 100)
         node.create_subscription(DiagnosticArray, "/diagnostics", self._take_status, 10)
         node.create_subscription(kind, f"{own}/map_to_odom", self._take_sure, 100)
         self._clicked = node.create_publisher(kind, f"{space}/initialpose", 10)
@@ -219,13 +213,11 @@ class _Around:
         for when, metres in self._trouble.clicks:
             events.append((when, len(rates), functools.partial(self._click, metres)))
         heapq.heapify(events)
-        used, begun = cpu_time(self._pid), time.monotonic()
         while events:
             at, _, due = heapq.heappop(events)
             while (left := at - self._since()) > 0.0:
                 self._executor.spin_once(timeout_sec=left)
             due(at)
-        self.heard.cpu = (cpu_time(self._pid) - used) / (time.monotonic() - begun)
         self.listener.unregister()
 
     def _since(self) -> float:
@@ -233,10 +225,6 @@ class _Around:
 
     def _stamp(self, at: float) -> int:
         return self._base_ns + round(1e9 * at)
-
-    def _take_odometry(self, message: Odometry) -> None:
-        p, stamp = message.pose.pose.position, stamp_ns(message) - self._base_ns
-        self.heard.odometry.append((stamp, self._since(), np.array([p.x, p.y, p.z])))
 
     def _take_status(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -427,46 +415,17 @@ def _line(name: str, heard: Heard, begin: float, end: float, after: float) -> st
     )
 
 
-def rate(hertz: float, seconds: float) -> list[str]:
-    """Lines on odometry between images."""
-    heard = driven(Trouble(seconds), DRIFTS[0], output_rate=hertz)
-    settled = heard.odometry[round(2.0 * hertz) :]
-    stamps, times = (np.array([each[k] for each in settled]) for k in (0, 1))
-    stamps, places = 1e-9 * stamps, np.array([each[2] for each in settled])
-    drive = Drive(0.0)
-    truth = np.array([drive.body(t).translation for t in stamps])
-    off = 1e3 * np.linalg.norm(places - truth, axis=1)
-    intervals, late = 1e3 * np.diff(times), 1e3 * (times - stamps)
-
-    def spread(values: Array, unit: str) -> str:
-        low, middle, high, most = np.percentile(values, (1, 50, 99, 100))
-        return f"{low:.1f} / {middle:.1f} / {high:.1f} / {most:.1f} {unit}"
-
-    heard_rate = len(times) / (times[-1] - times[0])
-    return [
-        f"output_rate {hertz:g} Hz, {heard_rate:.1f} Hz heard; CPU {heard.cpu:.0%} of a core",
-        "1 % / median / 99 % / largest",
-        f"intervals between messages  {spread(intervals, 'ms')}",
-        f"from stamp to arrival       {spread(late, 'ms')}",
-        f"error of the position       {spread(off, 'mm')}",
-    ]  # fmt: skip
-
-
 def main() -> None:
     """Run it."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.load.robot", description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
-    parser.add_argument("what", choices=("occlusions", "trouble", "rate"))
-    parser.add_argument("--rate", type=float, default=200.0, help="Hz")
-    parser.add_argument("--seconds", type=float, default=60.0, help="of the rate")
+    parser.add_argument("what", choices=("occlusions", "trouble"))
     args = parser.parse_args()
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_DOMAIN_ID"] = str(random.SystemRandom().randrange(1, 101))
-    made = {"occlusions": occlusions, "trouble": trouble}
-    lines = rate(args.rate, args.seconds) if args.what == "rate" else made[args.what]()
-    print("\n".join(lines))
+    print("\n".join(occlusions() if args.what == "occlusions" else trouble()))
 
 
 if __name__ == "__main__":
