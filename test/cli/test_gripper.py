@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from recorded import write_mp4
 
-from benchmarks.room_mapping import Piece, Room
 from rs_localizer import data
 from rs_localizer.cli.commands import main
 from rs_localizer.core.camera import Camera
@@ -22,7 +21,11 @@ from rs_localizer.io.trajectories import read_tum
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.offline.frame_table import read_parquet
 from rs_localizer.tools.mapping.gauge import through
+from rs_localizer.tools.simulation.renderer import Renderer
+from rs_localizer.tools.simulation.simulated_frames import frame_stamps
 from rs_localizer.tools.simulation.simulated_settings import ImageSettings
+from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
+from rs_localizer.tools.simulation.walls import marked_room
 
 pytest.importorskip("pycolmap")
 pytest.importorskip("pyarrow", reason="needs pyarrow", exc_type=ImportError)
@@ -31,32 +34,37 @@ READOUT, RATE = 0.03, 12.0
 SHUTTER = ["-p", f"readout_time:={READOUT}"]
 K = np.array([[260.0, 0.0, 159.5], [0.0, 260.0, 119.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(320, 240, K, readout_time=READOUT)
-WALK = Piece(37.4, 2.2, RATE)
-DEMOS = Piece(37.56, 0.5, RATE), Piece(38.3, 0.5, RATE)
-
-
-def film(room: Room, piece: Piece, path: Path) -> np.ndarray:
-    """A video; the stamps of its images, ns."""
-    path.parent.mkdir()
-    write_mp4(path, (image.pixels for image in room.images(piece)), RATE)
-    return np.array(room.stamps(piece))
+WALK, DEMOS = (37.4, 2.2), ((37.56, 0.5), (38.3, 0.5))  # start and duration, s
+MOTION = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
 
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory) -> SimpleNamespace:
+    """Videos along a recorded motion in a rendered room with markers; a map of the first one."""
     folder = tmp_path_factory.mktemp("gripper")
-    room = Room(read_tum(data.path(data.HAND_MOTION)), CAMERA, ImageSettings(noise=1.0))
-    film(room, WALK, folder / "room" / "room.mp4")
+    scene = marked_room(sampled_states(MOTION))
+    renderer = Renderer(CAMERA, scene.planes, ImageSettings(noise=1.0))
+
+    def film(start: float, duration: float, path: Path) -> np.ndarray:
+        """A video; the stamps of its images, ns."""
+        first = MOTION.intervals_ns[0][0] + round(1e9 * start)
+        every = frame_stamps(MOTION, CAMERA, RATE)
+        stamps = [ns for ns in every if first <= ns < first + round(1e9 * duration)]
+        path.parent.mkdir()
+        write_mp4(path, (renderer.image(MOTION, ns, (0, ns)) for ns in stamps), RATE)
+        return np.array(stamps)
+
+    film(*WALK, folder / "room" / "room.mp4")
     demos = [folder / f"demo_{k}" / f"demo_{k}.mp4" for k in range(len(DEMOS))]
-    stamps = [film(room, piece, path) for piece, path in zip(DEMOS, demos, strict=True)]
+    stamps = [film(*piece, path) for piece, path in zip(DEMOS, demos, strict=True)]
     lens = {"K": K.tolist(), "D": [0, 0, 0, 0], "width": 320, "height": 240}
     (folder / "camera.json").write_text(json.dumps(lens))
-    write_marker_map(folder / "wall.yaml", room.marker_map)
+    write_marker_map(folder / "wall.yaml", scene.marker_map)
     words = ["map", "build", str(folder / "room" / "room.mp4"), "--out", str(folder / "map")]
     words += ["--calibration", str(folder / "camera.json"), "--markers", str(folder / "wall.yaml")]
     assert main([*words, *SHUTTER]) == 0
     made = folder / "map"
-    return SimpleNamespace(folder=folder, room=room, demos=demos, stamps=stamps, map=made)
+    return SimpleNamespace(folder=folder, planes=scene.planes, demos=demos, stamps=stamps, map=made)
 
 
 def test_the_map_is_where_the_room_is_and_tells_what_its_landmarks_share(filmed):
@@ -64,7 +72,7 @@ def test_the_map_is_where_the_room_is_and_tells_what_its_landmarks_share(filmed)
 
     Two seconds of a walk do not tell how much errors of a second have in common.
     """
-    landmarks, planes = read_map_file(filmed.map / MAP, MAP_FRAME), filmed.room.planes
+    landmarks, planes = read_map_file(filmed.map / MAP, MAP_FRAME), filmed.planes
     off = np.array([(landmarks.points - p.corner) @ p.normal for p in planes])
     wall = np.abs(off).argmin(axis=0)
     off, normals = off[wall, np.arange(len(wall))], np.array([p.normal for p in planes])[wall]
@@ -101,7 +109,7 @@ def test_demonstrations_become_trajectories(filmed, tmp_path):
         assert len(good) >= 0.9 * len(mine)
         # Since the first image, whose stamp is 1 s.
         times = [int(filmed.stamps[k][0] + row["pose_stamp_ns"] - 10**9) for row in good]
-        true = [filmed.room.motion.state(time, np.zeros(1)).positions[0] for time in times]
+        true = [MOTION.state(time, np.zeros(1)).positions[0] for time in times]
         found = np.array([[row[name] for name in "xyz"] for row in good])
         both.append((found, np.array(true)))
         for name in ("pose_covariance", "twist_covariance"):
