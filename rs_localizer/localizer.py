@@ -43,7 +43,6 @@ from rs_localizer.estimation.left_out import LeftOut, left_out
 from rs_localizer.estimation.points import (
     NEAREST,
     Observed,
-    Sighted,
     checked,
     checked_of_rig,
     find_usable,
@@ -282,7 +281,10 @@ class Localizer:
             terms,
             generator(self.config.seed),
             assumed,
-            Sighted(exposure, points, pixels, usable, rotation),
+            exposure,
+            points,
+            usable,
+            rotation,
             modes,
         )
         # 2. Near the predicted motion, if the points agree with it (tracking).
@@ -309,9 +311,7 @@ class Localizer:
         assert prior.motion is not None
         threshold = self.config.inlier_threshold
         predicted = state_in(prior.motion, observed.centre)
-        terms = with_motion(
-            observed.terms, prior, observed.centre, observed.sighted.rotation is not None
-        )
+        terms = with_motion(observed.terms, prior, observed.centre, observed.rotation is not None)
         best = self._search.optimize(observed, predicted, _PREDICTION_SCALE * threshold, terms)
         posterior = self._settle(observed, best, terms)
         result = self._accept(observed, best, posterior, prior)
@@ -372,15 +372,15 @@ class Localizer:
         may_rest = self._assume(self._exposure.span)[1].may_rest and len(terms.informations) == 1
         if may_rest != assumed.may_rest:
             assumed = replace(assumed, may_rest=may_rest)
-        gate, sighted = self._gate(observed, best.state), observed.sighted
-        if sighted.rotation is not None:
+        gate = self._gate(observed, best.state)
+        if observed.rotation is not None:
             predicted = terms is not observed.terms
-            assumed = replace(assumed, in_frame=coupled_turn(sighted.rotation, predicted))
+            assumed = replace(assumed, in_frame=coupled_turn(observed.rotation, predicted))
         observations = observed.observations
         if not self._full:
             seen = observations.packed, observations.count
             return Posterior(*best_motion(*seen, best.state, terms, gate))._replace(gate=gate)
-        one_lens, most = sighted.exposure.alone, _WIDEST * gate
+        one_lens, most = observed.exposure.alone, _WIDEST * gate
         while True:
             posterior = frame_posterior(observations, best.state, terms, gate, assumed, one_lens)
             posterior = posterior._replace(gate=gate)
@@ -409,7 +409,7 @@ class Localizer:
         covariance[POSE] = covariance[:, POSE] = 0.0
         np.fill_diagonal(covariance[POSE, POSE], np.inf)
         of_velocities = unchecked(prior, covariance=covariance)
-        turned = observed.sighted.rotation is not None
+        turned = observed.rotation is not None
         return with_motion(observed.terms, of_velocities, observed.centre, turned)
 
     def _accept(

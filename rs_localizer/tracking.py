@@ -103,7 +103,7 @@ class _Track:
     share: float  # of inliers among the points
     window: MotionWindow
     swing: Array  # (18,18) covariance of the shaking about the window's motion, per readout
-    vibrations: Array  # (s,f) logarithms of the odds of each vibration, by all frames
+    vibrations: Array  # (k,) logarithms of the odds of each vibration, by all frames
 
 
 @dataclass(slots=True)

@@ -60,8 +60,8 @@ class Estimate(Motion):
     still_deviation: float = math.inf  # rad, orientation_deviation if the motion were known
     # (k,3) rad: coefficients of the in-frame rotation, vibration (rs_localizer.core.shake)
     shake: Array = field(default_factory=np.zeros((0, 3)).copy)
-    # (s,f) log evidence of each size and spectrum of vibration over none; empty: unknown
-    vibrations: Array = field(default_factory=np.zeros((0, 0)).copy)
+    # (k,) log evidence of each size of vibration over none; empty: unknown
+    vibrations: Array = field(default_factory=np.zeros(0).copy)
     model_error: float = 0.0  # px, rms error of map, lens and motion beside the noise
     declared_error: float = 0.0  # px, the part of it that map and calibration are declared to have
     tracked: bool = False  # found near a prior motion, without a search

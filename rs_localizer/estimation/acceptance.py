@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure
 from rs_localizer.core.state import (
@@ -81,12 +81,7 @@ def unfit(exposure: Exposure, pixels: Array, usable: Usable, needed: int) -> Fai
 
 
 def refusal(
-    posterior: Posterior,
-    samples: int,
-    *,
-    min_inliers: int,
-    threshold: float,
-    rolling: bool,
+    posterior: Posterior, samples: int, *, min_inliers: int, threshold: float, rolling: bool
 ) -> Failure | None:
     """Return the reason to refuse an estimate, or None.
 
@@ -96,26 +91,16 @@ def refusal(
         min_inliers, threshold: of the configuration.
         rolling: whether velocities were estimated.
     """
-    state, count = posterior.state, len(posterior.inliers)
-    found, needed = int(np.count_nonzero(posterior.inliers)), min_inliers
-    if found < needed:
-        behind = int(np.count_nonzero(np.isinf(posterior.squared_errors)))
-        if 2 * behind > count:
-            return Failure(
-                Reason.BEHIND_CAMERA,
-                f"{behind} of {count} points lie behind the camera",
-            )
-        return Failure(
-            Reason.TOO_FEW_INLIERS,
-            f"{found} inliers of {count} points after {samples} samples, {needed} are needed",
-        )
+    found = int(np.count_nonzero(posterior.inliers))
+    if found < min_inliers:
+        return _too_few(posterior.inliers, posterior.squared_errors, samples, min_inliers)
     if not posterior.determined:
         return Failure(
             Reason.DEGENERATE,
             f"{found} inliers do not determine the motion: smallest eigenvalue of the scaled "
             f"information {posterior.smallest_eigenvalue:.1e}",
         )
-    if not (np.all(np.isfinite(state)) and np.all(np.isfinite(posterior.covariance))):
+    if not (np.isfinite(posterior.state).all() and np.isfinite(posterior.covariance).all()):
         return Failure(
             Reason.DEGENERATE,
             f"{found} inliers leave the motion so open that it cannot be computed",
@@ -139,6 +124,18 @@ def refusal(
     return None
 
 
+def _too_few(inliers: BoolArray, squared_errors: Array, samples: int, needed: int) -> Failure:
+    """Return the failure of a motion with too few inliers."""
+    behind, count = int(np.count_nonzero(np.isinf(squared_errors))), len(inliers)
+    if 2 * behind > count:
+        return Failure(Reason.BEHIND_CAMERA, f"{behind} of {count} points lie behind the camera")
+    return Failure(
+        Reason.TOO_FEW_INLIERS,
+        f"{np.count_nonzero(inliers)} inliers of {count} points after {samples} samples, "
+        f"{needed} are needed",
+    )
+
+
 def noise_fills(posterior: Posterior, rolling: bool) -> bool:
     """Return whether errors are as large as the gate allows, so that the noise is unknown."""
     most = _MOST_NOISE if rolling else _MOST_NOISE_GLOBAL_SHUTTER
@@ -148,7 +145,7 @@ def noise_fills(posterior: Posterior, rolling: bool) -> bool:
 def speeding(observed: Observed, state: Array) -> float:
     """Return the squared velocities, in standard deviations that the configuration expects."""
     # Of the others a rotation prior knows.
-    part = VELOCITIES if observed.sighted.rotation is None else LINEAR
+    part = VELOCITIES if observed.rotation is None else LINEAR
     velocities = state[POSE_SIZE - POSE.stop :][part]
     return float(velocities @ observed.terms.informations[0][part, part] @ velocities)
 
@@ -186,17 +183,12 @@ def sample_estimate(
         threshold: px, of inliers.
         fewest: inliers of an accepted pose.
     """
-    usable, rotation = observed.sighted.usable, rotation_of(state)
-    residuals = np.full(len(observed.sighted.points), np.nan)
-    residuals[usable.indices] = np.sqrt(observed.observations.squared_errors(state))
-    inliers = residuals < threshold  # NaN is none
-    found = int(np.count_nonzero(inliers))
-    if found < fewest:
-        return Failure(
-            Reason.TOO_FEW_INLIERS,
-            f"{found} inliers of {observed.observations.count} points after {samples} samples, "
-            f"{fewest} are needed",
-        )
+    errors = observed.observations.squared_errors(state)
+    inliers = errors < threshold**2
+    if np.count_nonzero(inliers) < fewest:
+        return _too_few(inliers, errors, samples, fewest)
+    rotation = rotation_of(state)
+    inliers, residuals = _of_all(observed, inliers, errors)
     return Estimate(
         rotation=rotation,
         translation=state[STATE_TRANSLATION] - rotation @ observed.centre,
@@ -206,8 +198,18 @@ def sample_estimate(
         residuals=residuals,
         joint_covariance=np.full((PARAMETERS, PARAMETERS), np.nan),
         iterations=samples,
-        span=observed.sighted.exposure.span,
+        span=observed.exposure.span,
     )
+
+
+def _of_all(
+    observed: Observed, inliers: BoolArray, squared_errors: Array
+) -> tuple[BoolArray, Array]:
+    """Return inliers and residuals of all points that were given, by those of the usable ones."""
+    indices, count = observed.usable.indices, len(observed.points)
+    residuals, every = np.full(count, np.nan), np.zeros(count, dtype=np.bool_)
+    residuals[indices], every[indices] = np.sqrt(squared_errors), inliers
+    return every, residuals
 
 
 def estimate_of(
@@ -221,12 +223,9 @@ def estimate_of(
         effect: of what map and calibration are off.
         predicted: frames before tell how the camera moves.
     """
-    state, known = posterior.state, observed.sighted.rotation
+    state, known = posterior.state, observed.rotation
     rotation = rotation_of(state)
-    indices, count = observed.sighted.usable.indices, len(observed.sighted.points)
-    residuals, inliers = np.full(count, np.nan), np.zeros(count, dtype=np.bool_)
-    residuals[indices] = np.sqrt(posterior.squared_errors)
-    inliers[indices] = posterior.inliers
+    inliers, residuals = _of_all(observed, posterior.inliers, posterior.squared_errors)
     rate, change = state[STATE_ANGULAR], state[STATE_ANGULAR_ACCELERATION]
     covariance = posterior.covariance
     # The noise of this frame is an estimate, and what is on an arc leaves its tangent.
@@ -257,7 +256,7 @@ def estimate_of(
         declared_error=promised(posterior),
         iterations=samples,
         aided=known is not None,
-        span=observed.sighted.exposure.span,
+        span=observed.exposure.span,
         calibration_covariance=effect.covariance,
         still_deviation=effect.still_deviation,
         twist_known=predicted or _knows_velocities(posterior),

@@ -28,8 +28,9 @@ from rs_localizer.core.lens import by_lens, coefficients_of, corner_of
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE, TURN, rotation_of
 from rs_localizer.estimation.hypotheses import Posterior
+from rs_localizer.estimation.linear_fit import known_at
 from rs_localizer.estimation.points import Observed, rays_of_lens
-from rs_localizer.estimation.prior import SPEEDS, PriorTerms, add_prior, terms_at
+from rs_localizer.estimation.prior import SPEEDS, PriorTerms, terms_at
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.robust import inverted
 from rs_localizer.estimation.smooth_error import ORDINARY, smooth_columns
@@ -107,29 +108,24 @@ def calibration_effect(
         of_map: errors of the points; None: they have none.
     """
     observations, chosen = observed.observations, posterior.inliers
-    exposure = observed.sighted.exposure
+    exposure = observed.exposure
     tau = observations.tau
     lines = linearized(
         observations.packed, len(tau), posterior.state, shake_at(tau, posterior.shake)
     )
     by_motion, image, tau = lines.by_motion[chosen], lines.image[chosen], tau[chosen]
-    rotation = observed.sighted.rotation
+    rotation = observed.rotation
     rays = image if rotation is None else rays_of_lens(rotation, tau, image)
-    if len(exposure.sides) == 1:
-        (side,) = exposure.sides
-        columns = _columns(side.camera, side.towards(rays), deviation)
-    else:
-        of_side = observations.camera[chosen]
-        columns = np.zeros((len(rays), 2, _ERRORS * len(exposure.cameras)))
-        for place, side in enumerate(exposure.sides):
-            here, first = of_side == place, _ERRORS * side.place
-            if np.any(here):
-                columns[here, :, first : first + _ERRORS] = _columns(
-                    side.camera, side.towards(rays[here]), deviation
-                )
+    of_side = observations.camera[chosen]
+    columns = np.zeros((len(rays), 2, _ERRORS * len(exposure.cameras)))
+    for place, side in enumerate(exposure.sides):
+        here, first = of_side == place, _ERRORS * side.place
+        if np.any(here):
+            columns[here, :, first : first + _ERRORS] = _columns(
+                side.camera, side.towards(rays[here]), deviation
+            )
     if of_map is not None:
-        sighted = observed.sighted
-        moved = of_map.at(sighted.points[sighted.usable.indices[chosen]])
+        moved = of_map.at(observed.points[observed.usable.indices[chosen]])
         # A camera that moves as the point does would move it the other way: of a deviation either
         # sign will do.
         by_point = by_motion[:, :, MOVE] @ rotation_of(posterior.state)
@@ -155,18 +151,16 @@ def calibration_effect(
         of_motion - explained @ beside,
         crossed[motion] - explained @ crossed[PARAMETERS:],
     )
-    pull, taken = np.zeros((MOTION_PARAMETERS, crossed.shape[1])), np.zeros_like(of_errors)
+    inverses = np.zeros((2, PARAMETERS, PARAMETERS))  # with and without the smooth error
     for speed, part in zip(SPEEDS, parts.tolist(), strict=True):
-        if part < _NO_PART:
-            continue
-        prior, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
-        of_speed = terms_at(terms, speed, rotation is not None)
-        add_prior(of_speed, posterior.state, variance, prior, slope)
-        inverse, alone = inverted(information + prior), inverted(of_motion + prior)
-        if not (math.isfinite(inverse[0, 0]) and math.isfinite(alone[0, 0])):
-            return NO_EFFECT._replace(still_deviation=still)
-        pull -= part * (inverse[:MOTION_PARAMETERS] @ crossed)
-        taken += part * (alone @ of_errors)
+        if part > _NO_PART:
+            of_speed = terms_at(terms, speed, rotation is not None)
+            prior = variance * known_at(of_speed, posterior.state).form[motion, motion]
+            inverses[0] += part * inverted(information + prior)
+            inverses[1] += part * inverted(of_motion + prior)
+    if not np.isfinite(inverses).all():
+        return NO_EFFECT._replace(still_deviation=still)
+    pull, taken = inverses[0, :MOTION_PARAMETERS] @ crossed, inverses[1] @ of_errors
     # What no motion takes up.
     left = np.trace(every[fitted:, fitted:]) + np.sum(taken * (of_motion @ taken - 2.0 * of_errors))
     residual = math.sqrt(max(float(left), 0.0) / max(len(rows), 1))

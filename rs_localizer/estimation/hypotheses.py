@@ -4,7 +4,7 @@
 
 docs/estimator.md is the page. A camera rests or moves at a typical speed, and is steady or
 vibrates within its frame: each is a Gaussian with its evidence (:mod:`.linear_fit`,
-:mod:`.leans`), and the mean and the covariance of their mixture go out (:mod:`.gaussian`).
+:mod:`.gaussian`), and the mean and the covariance of their mixture go out (:mod:`.gaussian`).
 """
 
 from __future__ import annotations
@@ -22,25 +22,34 @@ from rs_localizer.core.state import (
     PARAMETERS,
     POSE,
     POSE_SIZE,
+    STATE_TRANSLATION,
     VELOCITIES,
     step_between,
 )
-from rs_localizer.estimation.gaussian import Gaussians, mixture, weights_of
-from rs_localizer.estimation.known_rotation import coupled, uncoupled
-from rs_localizer.estimation.leans import Frame, Mode, linear_at, mode_of, over_leans
+from rs_localizer.estimation.gaussian import (
+    Frame,
+    Gaussians,
+    along_arcs,
+    linear_at,
+    mixture,
+    mode_of,
+    over_leans,
+    weights_of,
+)
 from rs_localizer.estimation.linear_fit import (
+    IN_FUNCTIONS,
     MIDDLE,
     NO_TURN,
-    SPECTRA,
     TURNS,
     VIBRATION,
-    Linear,
     Noise,
     TurnPrior,
+    changed,
     fit,
     known_at,
     linear_of,
     moved,
+    of_changed,
     under,
     without,
 )
@@ -57,7 +66,6 @@ from rs_localizer.estimation.robust import (
 )
 from rs_localizer.estimation.smooth_error import (
     ORDINARY,
-    Shared,
     bend_of,
     nothing_shared,
     smooth_error,
@@ -83,9 +91,8 @@ _KEPT = 0.9
 _NO_PART = 1e-4
 # Log odds of no vibration: one in ten of the cameras that do not show vibration has some.
 _HIDDEN_ODDS = math.log(10.0)
-# Logarithm of the evidence of an ordinary vibration against none from which it is fitted, and of
-# the ordinary spectrum, one of several, from which all are looked at.
-_ASKS, _MAY_SHAKE = -0.5, -1.8
+# Logarithm of the evidence of an ordinary vibration against none from which it is fitted.
+_ASKS = -0.5
 # One frame tells no more of a vibration than this logarithm of odds: none is as Gaussian as that.
 _MOST_TOLD = 5.0
 # A last step this short, in squared standard deviations: the next one is its square.
@@ -120,8 +127,8 @@ class Posterior(NamedTuple):
     arched: Array | None = None
     # (12,12) of pose and velocities, beside the covariance: vibration that hides in the noise
     undetected: Array = np.zeros((12, 12))
-    # (s,f) logarithms of the evidence of each vibration, against none; empty: not looked at
-    vibrations: Array = np.zeros((0, 0))
+    # (k,) logarithms of the evidence of each vibration, against none; empty: not looked at
+    vibrations: Array = np.zeros(0)
     # (n,b): of what the smooth error is a combination (see frame_fit), which other frames share, so
     # that the covariance does not have it, either
     bend: Array = np.zeros((0, 0))
@@ -220,10 +227,9 @@ def _of_points(
     planar, _, _ = plane_of(observations.points, best.inliers)
     is_clear = not (declares or planar) and _clearly_moving(given)
     hypotheses = speeds_of(terms, assumed, is_clear)
-    modes = _modes(given.frame, hypotheses, best.state, planar)
-    if not modes:
+    steady = _steady(given, hypotheses, planar)
+    if steady is None:
         return best._replace(smallest_eigenvalue=0.0)
-    steady = _steady(given, modes)
     groups = [steady]
     if assumed.rolling and assumed.in_frame is not None:
         turning = _vibrating(given, hypotheses, steady.posterior, assumed.in_frame.rest)
@@ -279,13 +285,11 @@ def speeds_of(terms: PriorTerms, assumed: Assumed, is_clear: bool) -> list[Motio
     ]
 
 
-def _modes(
-    frame: Frame, hypotheses: list[MotionHypothesis], start: Array, planar: bool
-) -> list[tuple[MotionHypothesis, Mode]]:
-    """Return the Gaussians of the hypotheses of a steady camera, as far as they are probable."""
-    modes, best, near = [], -math.inf, start
+def _steady(given: _Given, hypotheses: list[MotionHypothesis], planar: bool) -> _Camera | None:
+    """Return the Gaussians of a camera without in-frame rotation, of hypotheses that may be."""
+    frame, near, kept, best = given.frame, given.best.state, [], -math.inf
     if len(hypotheses) > 1:
-        near = np.concatenate([start[:POSE_SIZE], np.zeros(len(start) - POSE_SIZE)])
+        near = np.concatenate([near[:POSE_SIZE], np.zeros(len(near) - POSE_SIZE)])
     linear = linear_at(frame, near)
     for one in hypotheses:
         mode, near, linear = mode_of(frame, near, linear, one.terms)
@@ -293,30 +297,29 @@ def _modes(
             mode = over_leans(frame, mode, one.terms)
         evidence = mode.evidence + one.odds
         if evidence > -math.inf:
-            modes.append((one, mode._replace(evidence=evidence)))
+            kept.append((mode, one.speed, one.preference, evidence))
         best = max(best, evidence)
         if evidence < best - _FAR_LESS_PROBABLE / TEMPER:
             break
-    return modes
-
-
-def _steady(given: _Given, modes: list[tuple[MotionHypothesis, Mode]]) -> _Camera:
-    """Return the hypotheses of cameras without in-frame rotation."""
+    if not kept:
+        return None
+    modes, speeds, *others = zip(*kept, strict=True)
+    preferences, evidences = map(np.array, others)
+    evidences = evidences - _of_outliers(given, given.best.inliers)
     parts = Gaussians(
-        np.array([mode.state for _, mode in modes]), np.zeros((len(modes), 0)),
-        np.array([mode.covariance for _, mode in modes]),
-        np.array([mode.evidence for _, mode in modes])
-        - _of_outliers(given, given.best.inliers),
+        np.array([mode.state for mode in modes]), np.zeros((len(modes), 0)),
+        np.array([mode.covariance for mode in modes]), evidences,
     )  # fmt: skip
-    preferences = np.array([one.preference for one, _ in modes])
-    _, likely = modes[int((parts.evidences + preferences).argmax())]
-    possible = weights_of(TEMPER * parts.evidences)
-    shared = math.sqrt(possible @ np.square([mode.size for _, mode in modes]))
-    speeds = np.zeros(len(SPEEDS))
-    speeds[[SPEEDS.index(one.speed) for one, _ in modes]] = possible
+    likely, possible = (
+        modes[int((evidences + preferences).argmax())],
+        weights_of(TEMPER * evidences),
+    )
+    shared = math.sqrt(possible @ np.square([mode.size for mode in modes]))
+    of_speeds = np.zeros(len(SPEEDS))
+    of_speeds[[SPEEDS.index(speed) for speed in speeds]] = possible
     posterior = given.best._replace(
         noise=likely.noise, freedom=likely.freedom, model_error=shared, shared=shared,
-        bend=given.bend, speeds=speeds, squared_errors=np.zeros(0),
+        bend=given.bend, speeds=of_speeds, squared_errors=np.zeros(0),
     )  # fmt: skip
     return _Camera(parts, preferences + STEADY_ODDS, posterior)
 
@@ -329,39 +332,30 @@ def _of_outliers(given: _Given, inliers: BoolArray) -> float:
 
 def _with_turn(given: _Given, hypotheses: list[MotionHypothesis], steady: _Camera) -> list[_Camera]:
     """Return hypotheses without in-frame rotation, and with it if it is possible."""
-    vibrating = None
-    prior, odds = _expected(given.assumed)
+    odds, before = VIBRATION.odds, given.assumed.of_vibration
+    if before.size:
+        odds = odds + before
+    expected = float(np.logaddexp.reduce(odds))
+    prior = VIBRATION._replace(odds=odds - expected)
     gain, undetected, vibrations = _hidden(given, steady.posterior, prior)
-    steady = steady._replace(posterior=steady.posterior._replace(vibrations=vibrations))
-    gain += odds
-    if gain > _ASKS:
-        vibrating = _vibrating(given, hypotheses, steady.posterior, prior)
+    gain, posterior = gain + expected, steady.posterior._replace(vibrations=vibrations)
+    vibrating = _vibrating(given, hypotheses, posterior, prior) if gain > _ASKS else None
     if vibrating is None:
         weight = 1.0 / (1.0 + math.exp(min(_HIDDEN_ODDS - TEMPER * gain, 700.0)))
-        return [steady._replace(posterior=steady.posterior._replace(
-            undetected=weight * undetected
-        ))]  # fmt: skip
+        return [steady._replace(posterior=posterior._replace(undetected=weight * undetected))]
+    steady = steady._replace(posterior=posterior)
     total, other = (np.logaddexp.reduce(one.parts.evidences) for one in (steady, vibrating))
     # As if any speed left it, where vibration hardly shows.
     raised = vibrating.parts.evidences + max(total + gain - other, 0.0)
     return [steady, vibrating._replace(parts=vibrating.parts._replace(evidences=raised))]
 
 
-def _expected(assumed: Assumed) -> tuple[TurnPrior, float]:
-    """Return the prior of a vibration by the frames before, and the logarithm of its odds."""
-    if not assumed.of_vibration.size:
-        return VIBRATION, 0.0
-    odds = VIBRATION.odds + assumed.of_vibration
-    total = float(np.logaddexp.reduce(odds, axis=None))
-    return VIBRATION._replace(odds=odds - total), total
-
-
 def _hidden(given: _Given, steady: Posterior, prior: TurnPrior) -> tuple[float, Array, Array]:
     """Return evidence and effect of vibration at the best motion without it.
 
     Returns:
-        logarithm of its evidence, against none; (12,12) second moments of the motion by it; (s,f)
-        logarithms of the evidence of each one.
+        logarithm of its evidence, against none; (12,12) second moments of the motion by it;
+        logarithms (k,) of the evidence of each size.
     """
     best, shared = given.best, given.frame.shared.at(steady.shared)
     own = steady.shared**2 * shared.squares
@@ -370,17 +364,12 @@ def _hidden(given: _Given, steady: Posterior, prior: TurnPrior) -> tuple[float, 
     noise = Noise(steady.noise, 1.0, decided)
     linear = linear_of(given.lines, best.inliers, True, shared.rows)
     known = known_at(given.terms, best.state)
-    # A track learns of each spectrum.
-    looked = VIBRATION.of_first() if prior is VIBRATION else prior
-    found = fit(linear, shared, known, noise, looked, True)
-    if found.gain > _MAY_SHAKE and looked is not prior:
-        looked = prior
-        found = fit(linear, shared, known, noise, looked, True)
+    found = fit(linear, shared, known, noise, prior, True)
     none = np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS))
     if not found.evidence > -math.inf:
-        return -math.inf, none, np.zeros((0, 0))
-    each = np.log(np.maximum(found.weights, TINY)) - looked.odds + found.gain
-    vibrations = np.tile(np.clip(each, -_MOST_TOLD, _MOST_TOLD), (len(SPECTRA) // len(each), 1))
+        return -math.inf, none, np.zeros(0)
+    each = np.log(np.maximum(found.weights, TINY)) - prior.odds + found.gain
+    vibrations = np.clip(each, -_MOST_TOLD, _MOST_TOLD)
     alone = fit(without(linear, "turn"), shared, known, noise, NO_TURN, True)
     place = slice(0, MOTION_PARAMETERS)
     move = _TURNED @ found.step - alone.step[place]
@@ -406,13 +395,17 @@ class _Turning(NamedTuple):
     squares: Array  # (n,) px^2
     inliers: BoolArray  # (n,)
 
+    def after(self, step: Array) -> tuple[Array, Array]:
+        """Return state and in-frame turn after a step (72,)."""
+        change = step[PARAMETERS:]
+        return apply_step(self.state, step[:PARAMETERS] + MIDDLE @ change), self.turn + change
+
 
 def _at(given: _Given, state: Array, turn: Array, gate: float) -> _Turning:
     """Return the points at a motion with in-frame rotation; inliers lie within a gate (px)."""
     observations = given.observations
-    data, count = observations.packed, observations.count
     shake = shake_at(observations.tau, COMBINATIONS @ turn.reshape(RESOLVED, 3))
-    lines = linearized(data, count, state, shake)
+    lines = linearized(observations.packed, observations.count, state, shake)
     squares = np.square(lines.errors).sum(axis=1)
     squares[np.isinf(observations.squared_errors(state))] = np.inf
     return _Turning(state, turn, lines, squares, squares < gate * gate)
@@ -422,111 +415,86 @@ def _vibrating(
     given: _Given, hypotheses: list[MotionHypothesis], steady: Posterior, prior: TurnPrior
 ) -> _Camera | None:
     """Return hypotheses with in-frame rotation, if such a fit converges to as many points."""
-    best, threshold = given.best, given.threshold
-    widest = WIDEST_GATE * threshold
-    gate, noise = min(max(threshold, GATE * best.noise), widest), best.noise
-    in_frame, short = given.assumed.in_frame, _SHORT
-    if in_frame is not None:  # near a rotation that is known the frame is more linear
-        short = 1.0
-    now, is_last, farthest = _at(given, best.state, np.zeros(TURNS), gate), False, math.inf
-    # Points decide all of the motion.
-    decided = float(PARAMETERS)
+    best, threshold, in_frame = given.best, given.threshold, given.assumed.in_frame
+    noise, fewest = best.noise, max(_KEPT * np.count_nonzero(best.inliers), _FEWEST_TURNING)
+    # Near a rotation that is known the frame is more linear.
+    short = _SHORT if in_frame is None else 1.0
+    state, turn, is_last = best.state, np.zeros(TURNS), False
     for k in range(_STEPS):
+        gate = min(max(threshold, GATE * noise), WIDEST_GATE * threshold)
+        now = _at(given, state, turn, gate)
         if np.count_nonzero(now.inliers) < _FEWEST_TURNING:
             return None
-        beside = _beside_turn(given, now)
-        known, linear = known_at(given.terms, beside.state), beside.linear
+        shared = smooth_error(now.lines, now.inliers, given.bend, given.size).at(given.size)
+        still = apply_step(now.state, -MIDDLE @ now.turn)
+        # From a camera that does not move or turn: the prior of one at rest is so sure of it that
+        # rounding would show.
+        first = np.concatenate([np.zeros(POSE.stop), -still[POSE_SIZE:], -now.turn])
+        still = apply_step(still, first[:PARAMETERS])
+        linear = moved(linear_of(now.lines, now.inliers, True, shared.rows), first)
         if in_frame is not None:
-            offset = step_between(given.terms.references[-1].copy(), beside.state)
-            linear = uncoupled(linear, in_frame.by_motion, offset)
-        found = fit(
-            linear, beside.shared, known, Noise(noise, 1.0, decided), prior,
-            is_last or k == _STEPS - 1,
-        )  # fmt: skip
+            offset = step_between(given.terms.references[-1].copy(), still)
+            linear = changed(linear, in_frame.coupling(offset))
+        known, is_last = known_at(given.terms, still), is_last or k == _STEPS - 1
+        # Points decide all of the motion.
+        found = fit(linear, shared, known, Noise(noise, 1.0, float(PARAMETERS)), prior, is_last)
         if in_frame is not None:
-            found = coupled(found, in_frame.by_motion, offset)
-        step = beside.step + found.step
-        if not found.evidence > -math.inf:
+            found = of_changed(found, in_frame.coupling(offset))
+        step = first + found.step
+        state, turn = now.after(step)
+        if not (found.evidence > -math.inf and np.isfinite(state).all()):
             return None
-        lengths = np.square(step) / np.maximum(np.diagonal(found.covariance), TINY)
-        farthest = float(lengths.max())
-        state, turn = _after(now, step)
-        if is_last or not np.isfinite(state).all():
+        farthest = float((step**2 / np.maximum(np.diagonal(found.covariance), TINY)).max())
+        if is_last:
             break
-        noise = max(found.noise, LEAST_NOISE)
-        gate = min(max(threshold, GATE * noise), widest)
-        now, is_last = _at(given, state, turn, gate), farthest < short
-    kept, had = np.count_nonzero(now.inliers), np.count_nonzero(best.inliers)
-    if not (farthest < 1.0 and kept >= _KEPT * had):
+        noise, is_last = max(found.noise, LEAST_NOISE), farthest < short
+    if not (farthest < 1.0 and np.count_nonzero(now.inliers) >= fewest):
         return None
-    parts, last = [], _at(given, state, turn, math.inf)
-    for one in hypotheses:
-        part = under(found, known, known_at(one.terms, beside.state))
-        parts.append((
-            *_after(now, beside.step + part.step), _with_middle(part.covariance),
-            part.evidence + one.odds,
-        ))  # fmt: skip
-    states, turns, covariances, evidences = (np.array(each) for each in zip(*parts, strict=True))
-    evidences -= _of_outliers(given, now.inliers)
-    preferences = np.array([one.preference for one in hypotheses])
+    fits = [under(found, known, known_at(one.terms, still)) for one in hypotheses]
+    states, turns = map(np.array, zip(*(now.after(first + one.step) for one in fits), strict=True))
+    parts = Gaussians(
+        states, turns, np.array([_with_middle(one.covariance) for one in fits]),
+        np.array([one.evidence for one in fits]) + [one.odds for one in hypotheses]
+        - _of_outliers(given, now.inliers),
+    )  # fmt: skip
     posterior = steady._replace(
         noise=found.noise, freedom=found.freedom, inliers=now.inliers, speeds=np.zeros(0),
-        squared_errors=last.squares, shared=given.size,
+        squared_errors=_at(given, state, turn, math.inf).squares, shared=given.size,
     )  # fmt: skip
-    return _Camera(Gaussians(states, turns, covariances, evidences), preferences, posterior)
-
-
-class _BesideTurn(NamedTuple):
-    """The products of motion and in-frame turn, from a camera that does not move."""
-
-    linear: Linear
-    shared: Shared
-    state: Array  # (24,) without its vibration
-    step: Array  # (72,) to there from where the lines are; the turn is whole
-
-
-def _beside_turn(given: _Given, now: _Turning) -> _BesideTurn:
-    shared = smooth_error(now.lines, now.inliers, given.bend, given.size).at(given.size)
-    linear = linear_of(now.lines, now.inliers, True, shared.rows)
-    still = apply_step(now.state, -MIDDLE @ now.turn)
-    # The step starts at no velocity: the prior of a camera at rest is so sure of it that rounding
-    # would show.
-    step = np.append(np.zeros(PARAMETERS), -now.turn)
-    step[POSE.stop : PARAMETERS] = -still[POSE_SIZE:]
-    return _BesideTurn(moved(linear, step), shared, apply_step(still, step[:PARAMETERS]), step)
-
-
-def _after(now: _Turning, step: Array) -> tuple[Array, Array]:
-    """State and in-frame turn after a step (72,)."""
-    change = step[PARAMETERS:]
-    return apply_step(now.state, step[:PARAMETERS] + MIDDLE @ change), now.turn + change
+    return _Camera(parts, np.array([one.preference for one in hypotheses]), posterior)
 
 
 def _mixed(given: _Given, groups: list[_Camera]) -> Posterior:
     """Mix all hypotheses; the inliers are those of the most probable kind."""
     if len(groups) > 1:
-        evidences = np.concatenate([one.parts.evidences for one in groups])
-        preferences = np.concatenate([one.preferences for one in groups])
-        first = len(groups[0].preferences)
+        first, evidences, preferences = len(groups[0].preferences), *_of_all(groups)
         shares = [
             weights_of(each)[:first].sum() for each in (TEMPER * evidences, evidences + preferences)
         ]
-        groups = [
-            one for one, part in zip(groups, (max(shares), 1.0 - min(shares)), strict=True)
-            if part > _NO_PART
-        ]  # fmt: skip
+        keeps = max(shares) > _NO_PART, 1.0 - min(shares) > _NO_PART
+        groups = [one for one, keep in zip(groups, keeps, strict=True) if keep]
     parts = groups[0].parts if len(groups) == 1 else _together(*(one.parts for one in groups))
-    found = mixture(parts, np.concatenate([one.preferences for one in groups]), TEMPER)
-    likely = groups[0].posterior
-    if len(groups) > 1 and found.probable[: len(groups[0].preferences)].sum() < 0.5:
-        likely = groups[1].posterior
+    found = mixture(parts, _of_all(groups)[1], TEMPER)
+    rather = len(groups) > 1 and found.probable[: len(groups[0].preferences)].sum() < 0.5
+    likely = groups[1 if rather else 0].posterior
     covariance, shake = found.covariance, np.zeros((0, 3))
     if len(found.turn):
-        covariance, shake = _in_functions(covariance), COMBINATIONS @ found.turn.reshape(-1, 3)
+        covariance = IN_FUNCTIONS @ covariance @ IN_FUNCTIONS.T
+        shake = COMBINATIONS @ found.turn.reshape(-1, 3)
     if not len(likely.squared_errors):  # of all steady ones, and not of the best one alone
         likely = likely._replace(squared_errors=given.observations.squared_errors(found.state))
-    return likely._replace(
-        state=found.state, covariance=covariance, arched=found.along_arcs(), shake=shake
+    arched = along_arcs(
+        found.covariance[:PARAMETERS, :PARAMETERS], found.state[STATE_TRANSLATION],
+        found.possible, found.offsets, found.covariances,
+    )  # fmt: skip
+    return likely._replace(state=found.state, covariance=covariance, arched=arched, shake=shake)
+
+
+def _of_all(groups: list[_Camera]) -> tuple[Array, Array]:
+    """Return evidences and preferences of all hypotheses."""
+    return (
+        np.concatenate([one.parts.evidences for one in groups]),
+        np.concatenate([one.preferences for one in groups]),
     )
 
 
@@ -537,14 +505,6 @@ def _together(steady: Gaussians, vibrating: Gaussians) -> Gaussians:
     covariances[:, :PARAMETERS, :PARAMETERS] = steady.covariances
     whole = steady._replace(turns=np.zeros((count, TURNS)), covariances=covariances)
     return Gaussians(*map(np.concatenate, zip(whole, vibrating, strict=True)))
-
-
-def _in_functions(covariance: Array) -> Array:
-    """Return the covariance (102,102) of motion and all coefficients, from one of (72,72)."""
-    half, size = covariance[:, PARAMETERS:].reshape(-1, RESOLVED, 3), PARAMETERS + TURNS
-    half = np.hstack([covariance[:, :PARAMETERS], (COMBINATIONS @ half).reshape(size, -1)])
-    turned = (COMBINATIONS @ half[PARAMETERS:].reshape(RESOLVED, -1)).reshape(-1, half.shape[1])
-    return np.vstack([half[:PARAMETERS], turned])
 
 
 def _clearly_moving(given: _Given) -> bool:

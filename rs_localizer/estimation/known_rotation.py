@@ -24,12 +24,10 @@ from rs_localizer.core.state import PARAMETERS
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.linear_fit import (
     BLOCKS,
+    IN_FUNCTIONS,
     MIDDLE,
     TURNS,
-    Linear,
-    LinearFit,
     TurnPrior,
-    moved,
 )
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.estimation.window import MotionSample
@@ -50,6 +48,16 @@ class CoupledTurn(NamedTuple):
     by_motion: Array  # (54,18)
     rest: TurnPrior
 
+    def coupling(self, offset: Array) -> Array:
+        """Return motion and turn (73,73) by the motion and the rest, where the motion is off (18,).
+
+        As :func:`.linear_fit.changed` takes it.
+        """
+        by = np.eye(WHOLE + 1)
+        by[PARAMETERS:WHOLE, :PARAMETERS] = self.by_motion
+        by[PARAMETERS:WHOLE, WHOLE] = self.by_motion @ offset
+        return by
+
 
 def coupled_turn(rotation: RotationPrior, predicted: bool) -> CoupledTurn:
     """Return the prior of the in-frame turn.
@@ -68,54 +76,28 @@ def coupled_turn(rotation: RotationPrior, predicted: bool) -> CoupledTurn:
     sizes = np.maximum(sizes, _LEAST**2)
     each = [sizes + missed**2 for missed in _MISSED]
     informations = np.array([(axes / one) @ axes.T for one in each])
-    odds = np.full((len(each), 1), math.log((1.0 - _COMPLETE) / (len(each) - 1)))
+    odds = np.full(len(each), math.log((1.0 - _COMPLETE) / (len(each) - 1)))
     odds[0] = math.log(_COMPLETE)
-    volumes = np.array([-0.5 * np.log(one).sum() for one in each])
-    return CoupledTurn(by_motion, TurnPrior(informations, volumes, np.ones(1), odds))
+    return CoupledTurn(by_motion, TurnPrior.of(informations, odds))
 
 
 def whole_covariance(covariance: Array) -> Array:
     """Return the covariance (102,102) of an estimate by one (72,72) of a motion without its
     vibration and an in-frame turn.
     """
-    functions = np.kron(COMBINATIONS, np.eye(3))
-    by_both = np.zeros((PARAMETERS + len(functions), WHOLE))
-    by_both[:PARAMETERS] = np.hstack([np.eye(PARAMETERS), MIDDLE])
-    by_both[PARAMETERS:, PARAMETERS:] = functions
+    by_both = IN_FUNCTIONS.copy()
+    by_both[:PARAMETERS, PARAMETERS:] = MIDDLE
     whole: Array = by_both @ covariance @ by_both.T
     return whole
 
 
 def with_turn(covariance: Array, rotation: RotationPrior) -> Array:
     """Return the covariance (102,102) of a motion (18,18) and what the rotation beside it is."""
-    functions, turn = np.kron(COMBINATIONS, np.eye(3)), BLOCKS["turn"]
-    joint = np.zeros((PARAMETERS + len(functions),) * 2)
+    joint, turn = np.zeros((WHOLE, WHOLE)), BLOCKS["turn"]
     joint[:PARAMETERS, :PARAMETERS] = covariance
-    joint[PARAMETERS:, PARAMETERS:] = functions @ rotation.covariance[turn, turn] @ functions.T
-    return joint
-
-
-def uncoupled(linear: Linear, by_motion: Array, offset: Array) -> Linear:
-    """Return the system of the motion and the rest of the turn, where the motion is off (18,)."""
-    linear = moved(linear, np.concatenate([np.zeros(PARAMETERS), by_motion @ offset]))
-    both = _both(by_motion)
-    return linear._replace(
-        own=both.T @ linear.own @ both, along=both.T @ linear.along, beside=linear.beside @ both
-    )
-
-
-def coupled(found: LinearFit, by_motion: Array, offset: Array) -> LinearFit:
-    """Return the fit of motion and turn by one of the motion and the rest of the turn."""
-    both = _both(by_motion)
-    step = both @ found.step
-    step[PARAMETERS:] += by_motion @ offset
-    return found._replace(step=step, covariance=both @ found.covariance @ both.T)
-
-
-def _both(by_motion: Array) -> Array:
-    both = np.eye(WHOLE)
-    both[PARAMETERS:, :PARAMETERS] = by_motion
-    return both
+    joint[turn, turn] = rotation.covariance[turn, turn]
+    whole: Array = IN_FUNCTIONS @ joint @ IN_FUNCTIONS.T
+    return whole
 
 
 def turn_of(estimate: Estimate) -> Array:

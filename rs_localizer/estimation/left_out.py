@@ -24,8 +24,8 @@ from rs_localizer.core.types import Failure
 from rs_localizer.estimation.acceptance import speeding
 from rs_localizer.estimation.calibration import promised
 from rs_localizer.estimation.hypotheses import Posterior
+from rs_localizer.estimation.linear_fit import known_at
 from rs_localizer.estimation.points import Observations, Observed
-from rs_localizer.estimation.prior import add_prior
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.robust import (
     EXPECTED_NOISE,
@@ -95,20 +95,6 @@ class _Group(NamedTuple):
     squared_errors: Array  # (n,) px^2
 
 
-class _Lens(NamedTuple):
-    """Points that one motion explains before a camera with another matrix."""
-
-    group: _Group
-    numbers: Array  # (3,) see _through
-
-
-class _Known(NamedTuple):
-    """A Gaussian of another matrix."""
-
-    mean: Array  # (3,) see _through
-    whitened: Array  # (3,3) of which the square is its information
-
-
 def left_out(
     search: MotionSearch, observed: Observed, posterior: Posterior, threshold: float, known: bool
 ) -> LeftOut:
@@ -132,7 +118,7 @@ def left_out(
     bent |= posterior.noise > EXPECTED_NOISE * threshold
     second = _own_motion(search, observed, rest, threshold) if left > _SAMPLE else None
     # Before K errors hang together: some of them over the image, or those of a second group.
-    alone = observed.sighted.exposure.alone
+    alone = observed.exposure.alone
     if not known and alone and (bent or second is not None):
         failure = _of_another_lens(search, observed, posterior, second, threshold)
         if failure is not None:
@@ -160,7 +146,7 @@ def left_out(
 
 def _is_off_centre(observed: Observed) -> bool:
     """Return whether K's principal point alone points to another image."""
-    return off_centre(observed.sighted.exposure.cameras[0])
+    return off_centre(observed.exposure.cameras[0])
 
 
 def _cameras_apart(observed: Observed, inliers: BoolArray, second: _Group, threshold: float) -> str:
@@ -169,7 +155,7 @@ def _cameras_apart(observed: Observed, inliers: BoolArray, second: _Group, thres
     A body before it moves otherwise than most of its points. Where all of them do, no image tells
     which camera is where it is said to be, and no frame before this one does.
     """
-    exposure = observed.sighted.exposure
+    exposure = observed.exposure
     if exposure.alone:
         return ""
     of = np.array([side.place for side in exposure.sides])[observed.observations.camera]
@@ -231,7 +217,7 @@ def _own_motion(
 
 def _area(observed: Observed) -> float:
     """Return the pixels of the smallest image."""
-    return float(min(math.prod(camera.size) for camera in observed.sighted.exposure.cameras))
+    return float(min(math.prod(camera.size) for camera in observed.exposure.cameras))
 
 
 def _of_another_lens(
@@ -239,29 +225,35 @@ def _of_another_lens(
     threshold: float,
 ) -> Failure | None:  # fmt: skip
     """Return the failure of a frame that another matrix explains better than two motions."""
-    lens = _another_lens(search, observed, threshold)
-    if lens is None:
-        return None
-    off = lens.numbers - _OF_K
-    usual, other = off / _USUAL, off / _DEVIATIONS
-    if 0.5 * (usual @ usual - other @ other) < np.log(_DEVIATIONS / _USUAL).sum():
-        return None
     area, count = _area(observed), observed.observations.count
+    resized = _is_off_centre(observed)
+    kinds = (False, True) if resized else (False,)
+    found = [_another_lens(search, observed, threshold, of_size) for of_size in kinds]
+    explained, group, numbers = max(
+        ((_evidence((group,), PARAMETERS + _LENS, count, area), group, numbers)
+         for group, numbers in found if np.any(group.chosen)),
+        key=lambda each: each[0], default=(-math.inf, None, _OF_K),
+    )  # fmt: skip
+    off = numbers - _OF_K
+    usual, other = off / _USUAL, off / _DEVIATIONS
+    if group is None or (
+        0.5 * (usual @ usual - other @ other) < np.log(_DEVIATIONS / _USUAL).sum()
+    ):
+        return None
     first = _Group(posterior.inliers, posterior.state, posterior.squared_errors)
     parts = [(first,)] if second is None else [(first,), (first, second)]
     evidence = max(_evidence(groups, PARAMETERS * len(groups), count, area) for groups in parts)
-    each = 0.0 if _is_off_centre(observed) else _EACH
-    least = evidence + max(each * count, _LEAST_CHANCE)
-    if _evidence((lens.group,), PARAMETERS + _LENS, count, area) < least:
+    if explained < evidence + max(0.0 if resized else _EACH * count, _LEAST_CHANCE):
         return None
-    more = np.count_nonzero(lens.group.chosen) - np.count_nonzero(first.chosen)
-    length, *shift = lens.numbers * (1.0, *[observed.assumed.focal_length] * 2)
+    fitting = np.count_nonzero(first.chosen)
+    more = np.count_nonzero(group.chosen) - fitting
+    length, *shift = numbers * (1.0, *[observed.assumed.focal_length] * 2)
     beside = f"and {more} more" if more > 0 else "and better"
     return Failure(
         Reason.CALIBRATION,
-        f"{np.count_nonzero(first.chosen)} points fit, {beside} with a focal length of "
-        f"{length:.2f} times K's and a principal point {shift[0]:+.0f}, {shift[1]:+.0f} px "
-        "from K's: is K, its binning or its region of interest that of another image?",
+        f"{fitting} points fit, {beside} with a focal length of {length:.2f} times K's and a "
+        f"principal point {shift[0]:+.0f}, {shift[1]:+.0f} px from K's: is K, its binning or its "
+        "region of interest that of another image?",
     )
 
 
@@ -277,61 +269,47 @@ def _evidence(groups: tuple[_Group, ...], parameters: int, count: int, area: flo
     return -density - (count - inside) * math.log(area) - 0.5 * parameters * math.log(2 * inside)
 
 
-def _another_lens(search: MotionSearch, observed: Observed, threshold: float) -> _Lens | None:
-    """Return the motion of most points with another focal length and principal point."""
-    area, count = _area(observed), observed.observations.count
-    kinds = (False, True) if _is_off_centre(observed) else (False,)
-    found = [_lens_of(search, observed, threshold, of_size) for of_size in kinds]
-    return max(
-        (lens for lens in found if lens is not None),
-        key=lambda lens: _evidence((lens.group,), PARAMETERS + _LENS, count, area),
-        default=None,
-    )
-
-
-def _lens_of(
+def _another_lens(
     search: MotionSearch, observed: Observed, threshold: float, of_size: bool
-) -> _Lens | None:
-    """Return the motion of most points with another matrix: of any image, or of a resized one.
+) -> tuple[_Group, Array]:
+    """Return the motion of most points with another matrix, and its numbers (3,): see _through.
 
-    ``of_size``: K is of an image of another size. The principal point then moves with the focal
-    length, and both show before a wall, where neither does alone.
+    It is that of any image or, ``of_size``, of a resized one. Of that the principal point moves
+    with the focal length, and both show before a wall, where neither does alone.
     """
     focal, last = observed.assumed.focal_length, WIDEST_GATE * threshold
-    camera, most = observed.sighted.exposure.cameras[0], _SAMPLE + _LENS
+    camera, most = observed.exposure.cameras[0], _SAMPLE + _LENS
     middle = centre_of(camera) / focal if of_size else 0.5 * np.array(camera.size) / focal
     gate, state, lens, least = 0.0, np.zeros(0), np.zeros(_LENS), math.inf
     enough = observed.observations.count - _SAMPLE
     for length, scaled in product(_LENGTHS, (True,) if of_size else (False, True)):
         tried = np.append(length, scaled * (length - 1.0) * middle)
-        through = _through(observed, tried)
+        through, circle = _through(observed, tried), length * GLOBAL_SHUTTER_SCALE * focal
         start = search.rough(through)
         if start.found:
             errors = through.observations.squared_errors(start.state)
-            near = errors < (length * GLOBAL_SHUTTER_SCALE * focal) ** 2
-            found, off = min(int(np.count_nonzero(near)), enough), float(np.median(errors))
+            found, off = min(np.count_nonzero(errors < circle**2), enough), float(np.median(errors))
             if found > most or (of_size and found == most and off < least):
-                most, least, state, lens = found, off, start.state, tried
-                gate = 2.0 * length * GLOBAL_SHUTTER_SCALE * focal
+                most, least, state, lens, gate = found, off, start.state, tried, 2.0 * circle
         if most >= enough and not of_size:
             break
+    nothing = _Group(np.zeros(0, np.bool_), state, np.zeros(0)), lens
     if not len(state):
-        return None
-    known = _Known(_OF_K, np.diag(1.0 / _DEVIATIONS))
+        return nothing
+    mean, whitened = _OF_K, np.diag(1.0 / _DEVIATIONS)
     if of_size:
-        known = _Known(lens, np.diag(1.0 / (_OF_SIZE * [lens[0], 1.0, 1.0])))
-        known.whitened[1:, 0] = -middle * np.diag(known.whitened)[1:]
+        mean, whitened = lens, np.diag(1.0 / (_OF_SIZE * [lens[0], 1.0, 1.0]))
+        whitened[1:, 0] = -middle * np.diag(whitened)[1:]
     left = _LAST_STEPS
     while left:
         gate = max(_NARROWER * gate, last)
         left -= gate == last
-        step = _step(_through(observed, lens), state, lens, known, gate)
+        step = _step(_through(observed, lens), state, whitened, whitened @ (lens - mean), gate)
         state, lens = apply_step(state, step[:PARAMETERS]), lens + step[PARAMETERS:]
         if not 0.5 * min(_LENGTHS) < lens[0] < 2.0 * max(_LENGTHS):  # NaN is not, either
-            return None
+            return nothing
     errors = _through(observed, lens).observations.squared_errors(state)
-    chosen = errors < last**2
-    return _Lens(_Group(chosen, state, errors), lens) if np.count_nonzero(chosen) else None
+    return _Group(errors < last**2, state, errors), lens
 
 
 def _through(observed: Observed, lens: Array) -> Observed:
@@ -340,7 +318,7 @@ def _through(observed: Observed, lens: Array) -> Observed:
     ``lens`` (3,) is its focal length over K's, and the offset of its principal point from K's, in
     focal lengths.
     """
-    seen, usable = observed.observations, observed.sighted.usable
+    seen, usable = observed.observations, observed.usable
     by_ray = lens[0] * usable.by_ray[usable.indices]
     rays = (seen.rays - lens[1:]) / lens[0]
     return replace(observed, observations=Observations.of(
@@ -348,27 +326,28 @@ def _through(observed: Observed, lens: Array) -> Observed:
     ))  # fmt: skip
 
 
-def _step(observed: Observed, state: Array, lens: Array, known: _Known, gate: float) -> Array:
-    """Return Gauss and Newton's step (21,) of motion and lens, by the points within a gate."""
-    seen, usable = observed.observations, observed.sighted.usable
+def _step(observed: Observed, state: Array, whitened: Array, off: Array, gate: float) -> Array:
+    """Return Gauss and Newton's step (21,) of motion and lens, by the points within a gate.
+
+    ``off`` (3,) is how far the lens is off from what is known of it, in deviations, and
+    ``whitened`` (3,3) its derivative.
+    """
+    seen, usable = observed.observations, observed.usable
     lines = linearized(seen.packed, seen.count, state, np.zeros((seen.count, 6)))
-    near = np.square(lines.errors).sum(axis=1) < gate**2  # NaN is not
+    near, size = np.square(lines.errors).sum(axis=1) < gate**2, PARAMETERS + _LENS  # NaN is not
     if np.count_nonzero(near) < _SAMPLE + _LENS:
-        return np.full(PARAMETERS + _LENS, np.nan)
+        return np.full(size, np.nan)
     by_ray = usable.by_ray[usable.indices][near]
     by_length = np.einsum("nij,nj->ni", by_ray, lines.image[near])[:, :, None]
-    columns = np.concatenate([lines.by_motion[near], by_length, by_ray], axis=2)
-    columns, errors = columns.reshape(-1, PARAMETERS + _LENS), lines.errors[near].ravel()
-    information, slope = columns.T @ columns, columns.T @ errors
-    of_motion, pull = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
-    add_prior(observed.terms, state, (EXPECTED_NOISE * gate) ** 2, of_motion, pull)
-    information[:PARAMETERS, :PARAMETERS] += of_motion
-    slope[:PARAMETERS] += pull
-    of_lens = (EXPECTED_NOISE * gate) ** 2 * known.whitened.T @ known.whitened
-    information[PARAMETERS:, PARAMETERS:] += of_lens
-    slope[PARAMETERS:] += of_lens @ (lens - known.mean)
-    step, positive = solve_positive(information, -slope)
-    return step if positive else np.full(PARAMETERS + _LENS, np.nan)
+    errors = lines.errors[near][:, :, None]
+    columns = np.concatenate([lines.by_motion[near], by_length, by_ray, errors], axis=2)
+    columns = columns.reshape(-1, size + 1) / (EXPECTED_NOISE * gate)
+    every, of_lens = columns.T @ columns, np.column_stack([whitened, off])
+    of_motion = np.r_[:PARAMETERS, size]
+    every[np.ix_(of_motion, of_motion)] += known_at(observed.terms, state).form
+    every[PARAMETERS:, PARAMETERS:] += of_lens.T @ of_lens
+    step, positive = solve_positive(every[:size, :size].copy(), -every[:size, size])
+    return step if positive else np.full(size, np.nan)
 
 
 def _surprise(total: int, size: int, sample: int, chance: float) -> float:

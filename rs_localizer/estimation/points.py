@@ -257,17 +257,6 @@ class Usable(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sighted:
-    """The points of one frame as they were given, and what of them can be used."""
-
-    exposure: Exposure
-    points: Array  # (n,3)
-    pixels: Array  # (n,2)
-    usable: Usable
-    rotation: RotationPrior | None  # what the rays are compensated by
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Observed:
     """The points of one image on their way through the steps, and what is known beside them."""
 
@@ -276,13 +265,16 @@ class Observed:
     terms: PriorTerms  # velocity prior and whatever else is known but the pose
     random: Random
     assumed: Assumed
-    sighted: Sighted
+    exposure: Exposure
+    points: Array  # (n,3) as they were given
+    usable: Usable  # what of these can be used
+    rotation: RotationPrior | None  # what the rays are compensated by
     error_modes: ErrorModes | None = None  # of the map
 
     @property
     def centre(self) -> Array:
         """(3,) map frame: origin of the observed points."""
-        return self.sighted.usable.centre
+        return self.usable.centre
 
 
 def find_usable(

@@ -33,7 +33,7 @@ from rs_localizer.core.state import (
     STATE_ANGULAR,
     STATE_SIZE,
 )
-from rs_localizer.native import entry, inlined, kernel
+from rs_localizer.native import entry, inlined
 from rs_localizer.solvers.table import Solver
 
 if TYPE_CHECKING:  # which needs this module
@@ -115,7 +115,7 @@ class Prior:
             the readout time (rad per readout), and its standard deviation.
         of_rest: logarithm of the odds that the camera does not move within the image, beside
             those of any camera.
-        of_vibration: (s,f) logarithms of the odds of each vibration against none by other frames,
+        of_vibration: (k,) logarithms of the odds of each vibration against none by other frames,
             beside those of any camera (``Estimate.vibrations``); empty: there were none.
         gravity, gravity_deviation: a vector (3,) in camera axes at the middle row that points
             along ``gravity_in_map``, of any length, and the standard deviation of its direction
@@ -133,7 +133,7 @@ class Prior:
     gravity_deviation: float = math.nan
     gravity_in_map: ArrayLike = (0.0, 0.0, -1.0)
     of_rest: float = 0.0
-    of_vibration: Array = field(default_factory=np.zeros((0, 0)).copy)
+    of_vibration: Array = field(default_factory=np.zeros(0).copy)
 
     def __post_init__(self) -> None:
         if (self.motion is None) != (self.covariance is None):
@@ -297,35 +297,19 @@ def with_motion(
     if prior.motion is None or not knows_motion(prior):
         return terms
     covariance = np.ascontiguousarray(prior.covariance, np.float64)
-    found: PriorTerms = _with_motion(terms, covariance, state_in(prior.motion, centre), turn_known)
-    return found
-
-
-@kernel
-def _turning(i: int) -> int:
-    """Place in a step of the turn rate, and of its change six places behind it."""
-    place: int = 6 + i + i // 3 * 3
-    return place
-
-
-@entry
-def _with_motion(
-    terms: PriorTerms, covariance: Array2, reference: Array1, turn_known: bool
-) -> PriorTerms:
-    informations, references, count = terms.informations, terms.references, len(terms.informations)
-    found = np.empty((count + 1, PARAMETERS, PARAMETERS))
-    of = np.empty((count + 1, STATE_SIZE))
-    found[:count], of[:count] = informations, references
-    found[count], of[count] = _inverse(covariance), reference
+    known = np.flatnonzero(np.isfinite(np.diagonal(covariance)))
+    information, informations = np.zeros((PARAMETERS, PARAMETERS)), terms.informations.copy()
+    information[np.ix_(known, known)] = np.linalg.inv(covariance[np.ix_(known, known)])
     if len(covariance) == PARAMETERS:  # it knows the accelerations better than a default
-        found[0, ACCELERATIONS] = 0.0
+        informations[0, ACCELERATIONS] = 0.0
         if turn_known:
-            for i in range(6):
-                for j in range(6):
-                    found[0, _turning(i), _turning(j)] = 0.0
-    pivots = np.zeros((count + 1, 3))
-    pivots[:count], pivots[count] = terms.pivots, pivot_of(covariance)
-    return PriorTerms(found, of, terms.gravity, pivots)
+            informations[0][_TURNING] = 0.0
+    added = information, state_in(prior.motion, centre), pivot_of(covariance)
+    informations, references, pivots = (
+        np.concatenate([each, one[None]])
+        for each, one in zip((informations, terms.references, terms.pivots), added, strict=True)
+    )
+    return PriorTerms(informations, references, terms.gravity, pivots)
 
 
 @entry
@@ -343,22 +327,6 @@ def pivot_of(covariance: Array2) -> Array:
         ])  # fmt: skip
         pivot = np.linalg.inv(turned) @ vector
     return pivot if np.all(np.isfinite(pivot)) else np.zeros(3)
-
-
-@inlined
-def _inverse(covariance: Array) -> Array:
-    """Return the information (18,18) of a covariance, zero for infinite variances."""
-    places = np.flatnonzero(np.isfinite(np.diag(covariance)))
-    known = len(places)
-    block, information = np.empty((known, known)), np.zeros((PARAMETERS, PARAMETERS))
-    for i in range(known):
-        for j in range(known):
-            block[i, j] = covariance[places[i], places[j]]
-    inverse = np.linalg.inv(block)
-    for i in range(known):
-        for j in range(known):
-            information[places[i], places[j]] = inverse[i, j]
-    return information
 
 
 def _unit(vector: ArrayLike) -> Array:
@@ -473,7 +441,7 @@ class Assumed:
     may_rest: bool  # nothing speaks for a motion but the points
     rolling: bool  # velocities are estimated
     of_rest: float = 0.0  # logarithm of the odds for rest, beside those of any camera
-    of_vibration: Array = field(default_factory=np.zeros((0, 0)).copy)  # see Prior
+    of_vibration: Array = field(default_factory=np.zeros(0).copy)  # see Prior
     turn: TurnSeen | None = None  # by a rotation prior
     in_frame: CoupledTurn | None = None  # likewise
 

@@ -387,14 +387,9 @@ def truncated_cost(data: Array2, state: Array1, scale: float, bound: float) -> f
 
 @entry
 def normal_equations(
-    data: Array2,
-    state: Array1,
-    scale: float,
-    softness: float,
-    looks: int,
-    information: Out[Array2],
-    slope: Out[Array1],
-) -> float:
+    data: Array2, state: Array1, scale: float, softness: float, looks: int,
+    information: Out[Array2], slope: Out[Array1],
+) -> float:  # fmt: skip
     """Fill ``information`` (p,p) = J^T W J and ``slope`` (p,) = J^T W e; returns the cost.
 
     ``looks`` at each point's row, see :class:`rs_localizer.estimation.projection.View`: 1 for

@@ -20,7 +20,6 @@ from rs_localizer.core.arrays import (
     Array2,
     Array3,
     BoolArray,
-    BoolArray1,
     IntArray,
     IntArray1,
     IntArray2,
@@ -51,81 +50,62 @@ _MOST_REDRAWS = 8
 _RANKED_HORIZON = 200_000
 
 
-class Pools(NamedTuple):
-    """Points to draw from: those of each camera, as a pool that gives its share of the samples.
+class Pool(NamedTuple):
+    """Points of one camera to draw from.
 
     In a ranked pool they are sorted from the best to the worst, and the first samples come from the
     first of them (PROSAC: Chum, Matas, "Matching with PROSAC", CVPR 2005).
     """
 
-    points: IntArray1  # of all pools, one after the other
-    ends: IntArray1  # (p,) where each of them ends
-    row_ranges: Array1  # (p,) of the row times of its camera's points
-    ranked: BoolArray1  # (p,)
-    shares: Array1  # (p,) of the points that it was made of
+    points: IntArray  # (n,)
+    row_range: float  # of the row times of its camera's points
+    share: float  # of the samples
+    growth: Array  # samples that lie in the first points, from a sample's size on; empty: all alike
+
+    @classmethod
+    def of(cls, points: IntArray, row_range: float, share: float, ranked: int) -> Pool:
+        """Return a pool, ``ranked`` for samples of this size; 0: not at all."""
+        total, growth = len(points), np.zeros(0)
+        if ranked:
+            k = np.arange(ranked)
+            first = np.arange(ranked, total)[:, None]
+            growth = _RANKED_HORIZON * np.prod((first - k) / (total - k), axis=1)
+        return cls(points, row_range, share, growth)
+
+    def prefixes(self, drawn: int, count: int) -> IntArray:
+        """Return from how many of the points each of the next (count,) samples is drawn."""
+        all_but = len(self.points) - len(self.growth)
+        return all_but + np.searchsorted(self.growth, drawn + np.arange(1.0, count + 1.0))
 
 
-@entry
 def pools_of(
-    camera: IntArray1, tau: Array1, cameras: int, size: int, among: BoolArray1, ranking: IntArray1,
-    also_all: bool,
-) -> Pools:  # fmt: skip
+    observations: Observations, size: int, among: BoolArray, ranking: IntArray, also_all: bool
+) -> list[Pool]:
     """Return a pool for each camera with enough points for a sample.
 
     Half of the samples ignore the scores, so that wrong ones cost a factor of two at most.
 
     Args:
-        camera, tau: (n,) of each point.
         size: of a sample.
         among: (n,) which points to take.
         ranking: points from the best to the worst; empty: they are alike.
         also_all: take all points, too, beside these; then only all are ranked.
     """
-    count, first = len(tau), 0 if also_all else 1
-    most = (3 - first) * cameras
-    points, ends = np.empty((3 - first) * count, np.int64), np.empty(most, np.int64)
-    row_ranges, ranked, shares = np.empty(most), np.empty(most, np.bool_), np.empty(most)
-    found, end = 0, 0
-    for group in range(first, 3):  # those near, by rank, and all
-        if group == 1 and len(ranking) == 0:
-            continue
-        everyone = also_all and group > 0
-        total = count if everyone else np.count_nonzero(among)
-        for place in range(cameras):
-            begin, low, high = end, np.inf, -np.inf
-            for k in range(count):
-                i = ranking[k] if group == 1 else k
-                if camera[i] == place:
-                    low, high = min(low, tau[i]), max(high, tau[i])
-                    if everyone or among[i]:
-                        points[end] = i
-                        end += 1
-            if end - begin < size:
-                end = begin
-                continue
-            ends[found], row_ranges[found] = end, high - low
-            ranked[found], shares[found] = group == 1, (end - begin) / total
-            found += 1
-    return Pools(
-        points[:end].copy(), ends[:found].copy(), row_ranges[:found].copy(),
-        ranked[:found].copy(), shares[:found].copy(),
-    )  # fmt: skip
-
-
-@kernel
-def prefix_sizes(total: int, first: int, size: int, prefixes: IntArray) -> None:
-    """Fill in from how many of a ranked pool's points samples ``first ...`` are drawn."""
-    n = size if total > size else total
-    for h in range(len(prefixes)):
-        while n < total:
-            # Expected number of the horizon's samples that lie in the first n points (T_n there).
-            expected = 1.0 * _RANKED_HORIZON
-            for k in range(size):
-                expected *= (n - k) / (total - k)
-            if expected >= first + h + 1:
-                break
-            n += 1
-        prefixes[h] = n
+    chosen, pools = np.flatnonzero(among), []
+    groups = [(np.arange(len(among)) if also_all else chosen, 0)]
+    if len(ranking):
+        groups.insert(0, (ranking if also_all else ranking[among[ranking]], size))
+    if also_all:
+        groups.insert(0, (chosen, 0))
+    for place in range(len(observations.mounts.axes)):
+        here = observations.camera == place
+        tau = observations.tau[here]
+        for points, ranked in groups:
+            own = points[here[points]]
+            if len(own) >= size:
+                row_range = float(tau.max() - tau.min())
+                pools.append(Pool.of(own, row_range, len(own) / len(points), ranked))
+    return pools
 
 
 @inlined
@@ -138,8 +118,11 @@ def _next(random: Any) -> Any:
     return z ^ (z >> np.uint64(31))
 
 
-@kernel
-def draw(pool: Any, prefixes: Any, tau: Array, row_range: float, random: Any, samples: Any) -> None:
+@entry
+def draw(
+    pool: IntArray1, prefixes: IntArray1, tau: Array1, row_range: float, random: Random,
+    samples: Out[IntArray2],
+) -> None:  # fmt: skip
     """Fill ``samples`` (h,n) with distinct points of the pool, row by row.
 
     Sample ``h`` comes from the first ``prefixes[h]`` points, which must be at least n.
@@ -166,24 +149,18 @@ def draw(pool: Any, prefixes: Any, tau: Array, row_range: float, random: Any, sa
                 break
 
 
-@entry
-def _draw_block(
-    pools: Pools, drawn: Out[IntArray1], tau: Array1, random: Random, samples: Out[IntArray2]
+def _draw_all(
+    pools: list[Pool], drawn: IntArray, tau: Array, random: Random, samples: IntArray
 ) -> None:
     """Fill the samples from all pools by their shares, and count what each has given."""
-    count, size = samples.shape
-    prefixes, ends = np.empty(count, np.int64), np.cumsum(pools.shares)
-    first, begin = 0, 0
-    for k in range(len(pools.ends)):
-        last = count if k == len(pools.ends) - 1 else int(ends[k] * count / ends[-1])
-        points, here = pools.points[begin : pools.ends[k]], prefixes[first:last]
-        if pools.ranked[k]:
-            prefix_sizes(len(points), drawn[k], size, here)
-        else:
-            here[:] = len(points)
-        draw(points, here, tau, pools.row_ranges[k], random, samples[first:last])
+    ends = np.cumsum([pool.share for pool in pools])
+    ends = (ends / ends[-1] * len(samples)).astype(np.int64)
+    ends[-1] = len(samples)
+    for k, (pool, last) in enumerate(zip(pools, ends.tolist(), strict=True)):
+        first = int(ends[k - 1]) if k else 0
+        prefixes = pool.prefixes(int(drawn[k]), last - first)
+        draw(pool.points, prefixes, tau, pool.row_range, random, samples[first:last])
         drawn[k] += last - first
-        first, begin = last, pools.ends[k]
 
 
 # The best two hypotheses of every block are optimized: a six-point model of inliers alone is often
@@ -242,14 +219,9 @@ def best_models(
 
 @entry
 def optimize(
-    states: Array2,
-    costs: Array1,
-    data: Array2,
-    first_scale: float,
-    last_scale: float,
-    prior: PriorTerms,
-    noise: float,
-) -> tuple[Array, float]:
+    states: Array2, costs: Array1, data: Array2, first_scale: float, last_scale: float,
+    prior: PriorTerms, noise: float,
+) -> tuple[Array, float]:  # fmt: skip
     """Optimize states with finite cost locally; return the best state and its truncated cost.
 
     Each is refined on all points under Tukey's loss while its scale falls from the first to the
@@ -301,7 +273,7 @@ class Draws(NamedTuple):
     """Pools that samples come from, and how many there may be."""
 
     rotation: Array  # (3,3) to start from
-    pools: Pools
+    pools: list[Pool]
     confidence: float
     most: int
     random: Random
@@ -322,13 +294,13 @@ def search(
     """
     solver, pools, mounts = hypotheses.solver, draws.pools, observations.mounts
     score, final, noise = hypotheses.score_scale, hypotheses.final_scale, hypotheses.noise
-    best, shares, drawn = start, None, np.zeros(len(pools.ends), np.int64)
+    best, shares, drawn = start, None, np.zeros(len(pools), np.int64)
     rotations, data = mounts.axes @ draws.rotation, observations.packed
     bar = observations.count * score**2
     left = draws.most if len(drawn) else 0
     while left > 0:
         samples = np.empty((min(hypotheses.block, left), solver.sample_size), np.int64)
-        _draw_block(pools, drawn, observations.tau, draws.random, samples)
+        _draw_all(pools, drawn, observations.tau, draws.random, samples)
         models = np.empty((solver.solutions, MODEL_SIZE, len(samples)))
         camera = observations.camera[samples[:, 0]]
         solver.solve(
@@ -343,8 +315,8 @@ def search(
             best, shares = found, None
         if shares is None and best.found:
             near = observations.within(best.state, final)
-            counts = np.diff(pools.ends, prepend=0)
-            shares = np.add.reduceat(near[pools.points] * 1.0, pools.ends - counts) / counts
+            shares = np.array([np.count_nonzero(near[each.points]) for each in pools])
+            shares = shares / [len(each.points) for each in pools]
         bar = min(bar, costs[0])
         left = draws.most - int(drawn.sum())
         # The chance that none of the samples held inliers alone.
@@ -416,10 +388,8 @@ class MotionSearch:
     def _global_shutter(self, observed: Observed, most: int) -> Candidate:
         """Find a pose that fits all rows roughly, with a wide threshold."""
         observations = observed.observations
-        pools = pools_of(
-            observations.camera, observations.tau, len(observations.mounts.axes),
-            self._start.sample_size, np.ones(observations.count, np.bool_), observed.ranking, False,
-        )  # fmt: skip
+        every, size = np.ones(observations.count, np.bool_), self._start.sample_size
+        pools = pools_of(observations, size, every, observed.ranking, False)
         draws = Draws(np.eye(3), pools, self._config.confidence, most, observed.random)
         return search(observations, self._starts, held_terms(), draws, NOTHING)
 
@@ -435,10 +405,8 @@ class MotionSearch:
             agreeing = near & observations.within(first.state, self._config.inlier_threshold)
             if np.count_nonzero(agreeing) < _AGREEING * np.count_nonzero(near):
                 first = self._facing(observed, start, near, first)
-        pools = pools_of(
-            observations.camera, observations.tau, len(observations.mounts.axes),
-            self._solver.sample_size, near, observed.ranking, True,
-        )  # fmt: skip
+        size = self._solver.sample_size
+        pools = pools_of(observations, size, near, observed.ranking, True)
         draws = Draws(
             rotation_of(start.state), pools, self._config.confidence, most, observed.random
         )

@@ -159,29 +159,18 @@ def smooth_error(lines: Lines, chosen: BoolArray1, bend: Array2, size: float) ->
         bend: (n,b), or (n,0): see :func:`smooth_columns`.
         size: px; its logarithm is known with a deviation of 1.
     """
-    sizes = size * np.exp(_SIZES)
     columns = smooth_columns(lines.by_motion[chosen], lines.image[chosen], bend[chosen])
-    count, q = len(columns), columns.shape[2]
-    if bend.shape[1] == 0:  # u and v have the same functions
-        half = np.ascontiguousarray(columns[:, 0, :TERMS])
-        values, axes = np.linalg.eigh(half.T @ half)
-        kept = np.flatnonzero(values > _LEAST_SQUARE * max(values[-1], 1e-300))
-        each, few = half @ np.ascontiguousarray(axes[:, kept]), len(kept)
-        rows, squares = np.zeros((2 * count, 2 * few)), np.empty(2 * few)
-        for k in range(few):
-            squares[k] = squares[few + k] = values[kept[k]]
-            length = math.sqrt(values[kept[k]])
-            for i in range(count):
-                rows[2 * i, k] = rows[2 * i + 1, few + k] = each[i, k] / length
-        return Shared(rows, squares, sizes, _ODDS.copy())
-    flat = columns.reshape(2 * count, q)
+    flat = columns.reshape(2 * len(columns), -1)
+    of_image = bend.shape[1] == 0  # u and v have the same functions
+    if of_image:
+        flat = np.ascontiguousarray(columns[:, 0, :TERMS])
     values, axes = np.linalg.eigh(flat.T @ flat)
     kept = np.flatnonzero(values > _LEAST_SQUARE * max(values[-1], 1e-300))
     squares = values[kept]
-    rows = flat @ np.ascontiguousarray(axes[:, kept])
-    for k in range(len(kept)):
-        rows[:, k] /= math.sqrt(squares[k])
-    return Shared(rows, squares, sizes, _ODDS.copy())
+    rows = flat @ np.ascontiguousarray(axes[:, kept]) / np.sqrt(squares)
+    if of_image:
+        rows, squares = np.kron(rows, np.eye(2)), np.repeat(squares, 2)
+    return Shared(rows, squares, size * np.exp(_SIZES), _ODDS.copy())
 
 
 def nothing_shared(count: int) -> Shared:

@@ -62,9 +62,7 @@ def test_speeding_counts_what_the_configuration_expects():
     state[12:15], state[15:18] = (0.2, 0.0, -0.1), (0.0, 0.03, 0.0)
     np.fill_diagonal(information[6:9, 6:9], 0.1**-2)
     np.fill_diagonal(information[9:12, 9:12], 0.01**-2)
-    observed = SimpleNamespace(
-        sighted=SimpleNamespace(rotation=None), terms=SimpleNamespace(informations=[information])
-    )
+    observed = SimpleNamespace(rotation=None, terms=SimpleNamespace(informations=[information]))
     assert speeding(observed, state) == pytest.approx(5.0 + 9.0)
-    observed.sighted.rotation = "of a gyroscope"
+    observed.rotation = "of a gyroscope"
     assert speeding(observed, state) == pytest.approx(9.0)

@@ -13,7 +13,7 @@ from rs_localizer.estimation.search import (
     NOTHING,
     Draws,
     Hypotheses,
-    Pools,
+    Pool,
     draw,
     generator,
     search,
@@ -61,10 +61,7 @@ def run(observations, solver, pools, max_samples=2000, start=NOTHING):
 
 def pools_from(*points, ranked=False):
     """Pools of equal shares."""
-    ends, count = np.cumsum([len(each) for each in points]), len(points)
-    return Pools(
-        np.concatenate(points), ends, np.full(count, ROWS), np.full(count, ranked), np.ones(count)
-    )
+    return [Pool.of(each, ROWS, 1.0, 6 if ranked else 0) for each in points]
 
 
 EVERYTHING = np.arange(100)
