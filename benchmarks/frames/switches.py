@@ -17,7 +17,7 @@ import numpy as np
 
 from rs_localizer.estimation.calibration import NO_EFFECT
 from rs_localizer.estimation.left_out import LeftOut
-from rs_localizer.estimation.smooth_error import nothing_shared
+from rs_localizer.estimation.linear_fit import nothing_shared
 
 
 class Switch(NamedTuple):

@@ -28,12 +28,11 @@ from rs_localizer.core.lens import by_lens, coefficients_of, corner_of
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE, TURN, rotation_of
 from rs_localizer.estimation.hypotheses import Posterior
-from rs_localizer.estimation.linear_fit import known_at
+from rs_localizer.estimation.linear_fit import ORDINARY, known_at, smooth_columns
 from rs_localizer.estimation.points import Observed, rays_of_lens
 from rs_localizer.estimation.prior import SPEEDS, PriorTerms, terms_at
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.robust import inverted
-from rs_localizer.estimation.smooth_error import ORDINARY, smooth_columns
 
 # Of each camera: centre (2), focal length, distortion, fy over fx.
 _ERRORS = 5
@@ -175,7 +174,7 @@ def promised(posterior: Posterior) -> float:
 def widened(effect: CalibrationEffect, posterior: Posterior) -> CalibrationEffect:
     """Return the effect of a calibration and a map whose errors exceed the declared ones.
 
-    To a factor of e their size is not known (:mod:`.smooth_error`). What lies beyond is an error
+    To a factor of e their size is not known (:mod:`.linear_fit`). What lies beyond is an error
     of the deviations, all of them alike (Birge's ratio): residuals do not tell which.
     """
     ratio = posterior.model_error / (math.e * promised(posterior))

@@ -40,6 +40,7 @@ from rs_localizer.estimation.linear_fit import (
     NO_TURN,
     Linear,
     Noise,
+    Shared,
     cost_of,
     fit,
     known_at,
@@ -50,7 +51,6 @@ from rs_localizer.estimation.points import leaning_less, plane_of
 from rs_localizer.estimation.prior import PriorTerms, offset_between
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.robust import TINY, apply_step
-from rs_localizer.estimation.smooth_error import Shared
 from rs_localizer.native import entry, inlined, kernel
 
 # Of y = (phi, d): d = -rho + [p]x phi by p; the forms of -phi x d, and of -phi x (phi x p) / 2 =

@@ -40,16 +40,20 @@ from rs_localizer.estimation.linear_fit import (
     IN_FUNCTIONS,
     MIDDLE,
     NO_TURN,
+    ORDINARY,
     TURNS,
     VIBRATION,
     Noise,
     TurnPrior,
+    bend_of,
     changed,
     fit,
     known_at,
     linear_of,
     moved,
+    nothing_shared,
     of_changed,
+    smooth_error,
     under,
     without,
 )
@@ -63,12 +67,6 @@ from rs_localizer.estimation.robust import (
     WIDEST_GATE,
     apply_step,
     best_motion,
-)
-from rs_localizer.estimation.smooth_error import (
-    ORDINARY,
-    bend_of,
-    nothing_shared,
-    smooth_error,
 )
 
 # Logarithm of the odds of rest against each typical speed before any frame: errors of maps that no

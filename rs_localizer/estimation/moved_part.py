@@ -25,10 +25,10 @@ from rs_localizer.core.rig import Exposure
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOTION_PARAMETERS, MOVE
 from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.linear_fit import DEGREE
 from rs_localizer.estimation.points import find_usable, packed
 from rs_localizer.estimation.prior import state_in
 from rs_localizer.estimation.projection import linearized
-from rs_localizer.estimation.smooth_error import DEGREE
 
 # Landmarks that are compared: more take longer than they are worth.
 _MOST = 60

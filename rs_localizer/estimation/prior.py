@@ -55,25 +55,20 @@ def check_motion(motion: Motion) -> None:
     Raises:
         ValueError: wrong shapes, values that are not finite, a rotation that is none.
     """
-    names = [each.name for each in fields(Motion)]
-    for name in names:
-        value, shape = getattr(motion, name), (3, 3) if name == "rotation" else (3,)
-        if np.shape(value) != shape:
+    for name in (each.name for each in fields(Motion)):
+        value, shape = (
+            np.asarray(getattr(motion, name), float),
+            (3, 3) if name == "rotation" else (3,),
+        )
+        if value.shape != shape:
             raise ValueError(
-                f"the prior motion's {name} must be of shape {shape}, got {np.shape(value)}"
+                f"the prior motion's {name} must be of shape {shape}, got {value.shape}"
             )
-    numbers = state_in(motion, _STILL[9:12])
-    if not np.abs(numbers).max() < _FARTHEST:  # NaN is not
-        for name in names:
-            value = np.asarray(getattr(motion, name), float)
-            if not np.all(np.abs(value) < _FARTHEST):
-                raise ValueError(f"the prior motion's {name} is not finite: {value}")
-    rotation = numbers[:9].reshape(3, 3)
-    off = np.abs(rotation @ rotation.T - _STILL[:9].reshape(3, 3)).max()
-    x, y, z = rotation.tolist()
-    volume = x[0] * (y[1] * z[2] - y[2] * z[1]) + x[1] * (y[2] * z[0] - y[0] * z[2])
-    volume += x[2] * (y[0] * z[1] - y[1] * z[0])
-    if not (off <= _ROUNDING and volume > 0.0):
+        if not np.all(np.abs(value) < _FARTHEST):
+            raise ValueError(f"the prior motion's {name} is not finite: {value}")
+    rotation = np.asarray(motion.rotation, float)
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if not (off <= _ROUNDING and np.linalg.det(rotation) > 0.0):
         raise ValueError(f"the prior motion's rotation is not orthonormal: {rotation.tolist()}")
 
 
@@ -261,24 +256,25 @@ def _single(information: Array, reference: Array) -> PriorTerms:
 
 def with_measurements(terms: PriorTerms, prior: Prior) -> PriorTerms:
     """Add the angular velocity and gravity of a prior to the terms."""
-    informations, references, gravity, pivots = terms
     if prior.angular_velocity is not None:
-        information = np.zeros((PARAMETERS, PARAMETERS))
+        information, reference = np.zeros((PARAMETERS, PARAMETERS)), _STILL.copy()
         information[ANGULAR, ANGULAR] = np.eye(3) / prior.angular_velocity_deviation**2
-        reference = _STILL.copy()
         reference[STATE_ANGULAR] = prior.angular_velocity
-        informations = np.concatenate([informations, information[None]])
-        references = np.concatenate([references, reference[None]])
-        pivots = np.concatenate([pivots, np.zeros((1, 3))])
+        terms = _with_term(terms, information, reference, np.zeros(3))
     if prior.gravity is not None:
-        gravity = np.concatenate(
-            [
-                _unit(prior.gravity_in_map),
-                _unit(prior.gravity),
-                [prior.gravity_deviation**-2],
-            ]
-        )
-    return PriorTerms(informations, references, gravity, pivots)
+        directions = _unit(prior.gravity_in_map), _unit(prior.gravity)
+        gravity = np.append(np.concatenate(directions), prior.gravity_deviation**-2)
+        terms = terms._replace(gravity=gravity)
+    return terms
+
+
+def _with_term(terms: PriorTerms, information: Array, reference: Array, pivot: Array) -> PriorTerms:
+    """Add a Gaussian (18,18) about a state (24,), with its pivot (3,), behind the others."""
+    return PriorTerms(
+        np.concatenate([terms.informations, information[None]]),
+        np.concatenate([terms.references, reference[None]]), terms.gravity,
+        np.concatenate([terms.pivots, pivot[None]]),
+    )  # fmt: skip
 
 
 def knows_motion(prior: Prior) -> bool:
@@ -298,18 +294,14 @@ def with_motion(
         return terms
     covariance = np.ascontiguousarray(prior.covariance, np.float64)
     known = np.flatnonzero(np.isfinite(np.diagonal(covariance)))
-    information, informations = np.zeros((PARAMETERS, PARAMETERS)), terms.informations.copy()
+    information = np.zeros((PARAMETERS, PARAMETERS))
     information[np.ix_(known, known)] = np.linalg.inv(covariance[np.ix_(known, known)])
     if len(covariance) == PARAMETERS:  # it knows the accelerations better than a default
-        informations[0, ACCELERATIONS] = 0.0
+        terms = terms._replace(informations=terms.informations.copy())
+        terms.informations[0, ACCELERATIONS] = 0.0
         if turn_known:
-            informations[0][_TURNING] = 0.0
-    added = information, state_in(prior.motion, centre), pivot_of(covariance)
-    informations, references, pivots = (
-        np.concatenate([each, one[None]])
-        for each, one in zip((informations, terms.references, terms.pivots), added, strict=True)
-    )
-    return PriorTerms(informations, references, terms.gravity, pivots)
+            terms.informations[0][_TURNING] = 0.0
+    return _with_term(terms, information, state_in(prior.motion, centre), pivot_of(covariance))
 
 
 @entry
@@ -418,8 +410,7 @@ def _add_gravity(
 _UNKNOWN_READOUT_TIME = 0.03
 
 
-@dataclass(frozen=True, slots=True)
-class TurnSeen:
+class TurnSeen(NamedTuple):
     """Speed of a motion as a rotation prior says it."""
 
     squared_rate: float  # (rad per readout)^2

@@ -16,9 +16,8 @@ from rs_localizer.estimation.gaussian import (
     mode_of,
     over_leans,
 )
-from rs_localizer.estimation.linear_fit import Noise
+from rs_localizer.estimation.linear_fit import Noise, nothing_shared
 from rs_localizer.estimation.prior import held_terms
-from rs_localizer.estimation.smooth_error import nothing_shared
 
 from .frames import fitted, observe
 from .projection import disturbed, in_camera, pixels_of

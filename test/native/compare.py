@@ -23,7 +23,7 @@ NUDGES = 20  # roundings of all arguments that are tried
 # What of a result is determined, where not all of it is.
 DETERMINED = {
     # Eigenvectors have either sign; what they span has none.
-    "rs_localizer.estimation.smooth_error.smooth_error": lambda smooth: (
+    "rs_localizer.estimation.linear_fit.smooth_error": lambda smooth: (
         smooth.rows @ smooth.rows.T, *smooth[1:]
     ),
     "rs_localizer.estimation.points.plane_of": lambda plane: (
