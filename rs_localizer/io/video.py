@@ -48,8 +48,9 @@ class Video:
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
-        self.claimed, self.read = 0, 0  # images by the container (0: it does not say), and read
-        self.lasts, self.until = 0.0, 0.0  # s, by the container (0: ...), and of the last image
+        self.lasts = self.until = (
+            0.0  # s, by the header (0: it does not say), and of the last image
+        )
         self.damaged = 0  # packets that could not be decoded
         self.captured: float | None = None  # images/s by the note of a phone; None: there is none
         if not self.path.is_file():
@@ -58,27 +59,20 @@ class Video:
     def __iter__(self) -> Iterator[VideoImage]:
         with self.path.open("rb") as file:
             timed = file.read(len(_JPEG_START)) != _JPEG_START
+        image = None
         for image in self._images():
-            self.read += 1
             self.until = max(self.until, image.seconds or 0.0)
             yield image if timed else image._replace(seconds=None)
-        if not self.read:
+        if image is None:
             raise VideoError(f"{self.path} holds no image that can be read")
 
     @property
     def fault(self) -> str | None:
         """Fault of a video with damaged or missing images: the end of a file is not believed."""
-        step = _NEAR * self.lasts / max(self.claimed, 1)  # an edit list hides images, not the end
-        ends_early = not self.lasts or self.until + step < self.lasts
         if self.damaged:
             said = f"has {self.damaged} images that cannot be decoded"
-        elif self.read + _UNCOUNTED < self.claimed and ends_early:
-            said = f"says that it has {self.claimed} images, {self.read} could be read"
-        elif not self.claimed and self.until + _UNTIMED < self.lasts:
-            said = (
-                f"says that it lasts {self.lasts:.1f} s, images could be read until "
-                f"{self.until:.1f} s"
-            )
+        elif self.until + _LONGER < self.lasts:
+            said = f"lasts {self.lasts:.1f} s by its header, and its images end at {self.until:.1f}"
         else:
             return None
         return f"{self.path.name} {said}: it is damaged or cut off"
@@ -90,10 +84,10 @@ class Video:
             stream.codec_context.options = {"max_pixels": str(most)}  # of images that follow
             stream.thread_type = "AUTO"
             timed = not container.format.flags & _NO_TIMES
-            # Matroska has no count, but says how long it lasts, of all streams.
-            self.claimed, last = stream.frames, -np.inf
+            last = -np.inf
             self.captured = _captured(container.metadata)
-            self.lasts = (container.duration or 0) * 1e-6
+            own = stream.duration  # None in Matroska, which says how long all streams last
+            self.lasts = float(own * stream.time_base) if own else (container.duration or 0) * 1e-6
             for packet in container.demux(stream):
                 for frame in self._decoded(packet):
                     seconds = float(frame.time) if timed and frame.time is not None else last
@@ -115,9 +109,8 @@ class Video:
 
 # FFmpeg's AVFMT_NOTIMESTAMPS, of raw streams.
 _NO_TIMES = 0x0080
-# Images that may be missing, images from the last one to the end, and s that another stream may
-# go on.
-_UNCOUNTED, _NEAR, _UNTIMED = 1, 3.0, 2.0
+# s that another stream, or the last image, may last.
+_LONGER = 2.0
 
 
 @contextlib.contextmanager
