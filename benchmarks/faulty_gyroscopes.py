@@ -160,7 +160,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--recordings", type=int, default=2, help="of 60 frames; %(default)s")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("faults", nargs="*", help=", ".join(FAULTS))
+    parser.add_argument("faults", nargs="*", help=", ".join(FAULTS).replace("%", "%%"))
     args = parser.parse_args(argv)
     print(table(args.faults or list(FAULTS), args.recordings, args.seed).text())
     return 0

@@ -434,8 +434,12 @@ def _vibrating(
             offset = step_between(given.terms.references[-1].copy(), still)
             linear = changed(linear, in_frame.coupling(offset))
         known, is_last = known_at(given.terms, still), is_last or k == _STEPS - 1
-        # Points decide all of the motion.
-        found = fit(linear, shared, known, Noise(noise, 1.0, float(PARAMETERS)), prior, is_last)
+        decided = float(PARAMETERS)  # by points
+        if in_frame is not None:  # a step that is short would change the noise alone
+            found = fit(linear, shared, known, Noise(noise, 1.0, decided), prior, False)
+            noise = max(found.noise, LEAST_NOISE)
+        finely = is_last or in_frame is not None
+        found = fit(linear, shared, known, Noise(noise, 1.0, decided), prior, finely)
         if in_frame is not None:
             found = of_changed(found, in_frame.coupling(offset))
         step = first + found.step
@@ -443,7 +447,7 @@ def _vibrating(
         if not (found.evidence > -math.inf and np.isfinite(state).all()):
             return None
         farthest = float((step**2 / np.maximum(np.diagonal(found.covariance), TINY)).max())
-        if is_last:
+        if is_last or (in_frame is not None and farthest < _SHORT):
             break
         noise, is_last = max(found.noise, LEAST_NOISE), farthest < short
     if not (farthest < 1.0 and np.count_nonzero(now.inliers) >= fewest):

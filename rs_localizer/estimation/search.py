@@ -379,19 +379,22 @@ class MotionSearch:
 
     def rough(self, observed: Observed) -> Candidate:
         """Find a pose that fits all rows of enough points roughly, or nothing."""
-        return self._global_shutter(observed, _START_SAMPLES)
+        return self._global_shutter(observed, _START_SAMPLES, _START_SAMPLES)
 
     def from_rough(self, observed: Observed, start: Candidate) -> Candidate:
         """Find the motion of most points near a rough pose, by few samples."""
         return self._motion(observed, start, _FEW_SAMPLES)
 
-    def _global_shutter(self, observed: Observed, most: int) -> Candidate:
+    def _global_shutter(
+        self, observed: Observed, most: int, block: int = _GLOBAL_SHUTTER_BLOCK
+    ) -> Candidate:
         """Find a pose that fits all rows roughly, with a wide threshold."""
         observations = observed.observations
         every, size = np.ones(observations.count, np.bool_), self._start.sample_size
         pools = pools_of(observations, size, every, observed.ranking, False)
         draws = Draws(np.eye(3), pools, self._config.confidence, most, observed.random)
-        return search(observations, self._starts, held_terms(), draws, NOTHING)
+        starts = self._starts._replace(block=block)
+        return search(observations, starts, held_terms(), draws, NOTHING)
 
     def _motion(self, observed: Observed, start: Candidate, most: int) -> Candidate:
         """Find the motion that most points agree on, from the solver's hypotheses."""
