@@ -15,16 +15,17 @@ import numpy as np
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation.prior import Prior
-from rs_localizer.io.clouds import Keypoints
+from rs_localizer.io.bags import make_message
+from rs_localizer.io.camera_info import read_camera_info
+from rs_localizer.io.images import Image
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.localizer import Localizer
-from rs_localizer.matching import Matcher, Matches
+from rs_localizer.io.recording import CAMERA_FRAME, MAP_FRAME, make_camera_info
+from rs_localizer.offline.replay import inlier_columns
+from rs_localizer.pipeline.camera_frames import CameraFrames
+from rs_localizer.pipeline.keypoints import Extracted, keypoints
 from rs_localizer.tools.mapping.map_keypoints import MapObservations, Start
 from rs_localizer.tools.mapping.seen_images import SeenImage
 from rs_localizer.tools.mapping.structure import Structure
-from rs_localizer.tracking import Tracker
 
 # A map that a global shutter has bent is off by more than good ones (px).
 _THRESHOLD = 4.0
@@ -47,7 +48,7 @@ def track_on_map(
         done: called after each view.
     """
     seen, start = structure.seen, structure.start
-    tracker = _MapTracker(Map(start.points, None, structure.descriptors, "map"), camera)
+    frames = _frames(structure, camera)
     ends = np.searchsorted(seen.images, np.arange(len(structure.views) + 1)).tolist()
     keyframes = {view: k for k, view in enumerate(structure.views.tolist())}
     rows, poses, points, pixels = [], [], [], []
@@ -60,11 +61,14 @@ def track_on_map(
             pixels.append(seen.pixels[own])
             rows.append(row)
         else:
-            estimate, matches = tracker.localize(view)
-            if estimate:
-                poses.append((estimate.rotation.T, estimate.position))
-                points.append(matches.landmarks[estimate.inliers])
-                pixels.append(view.features.pixels[matches.keypoints[estimate.inliers]])
+            image = Image(view.stamp_ns, CAMERA_FRAME, np.zeros((0, 0), np.uint8))
+            found = frames.localize_keypoints(
+                keypoints(Extracted(image, view.features), make_message)
+            )
+            if found:
+                poses.append((found.estimate.rotation.T, found.estimate.position))
+                points.append(found.inliers["id"].astype(np.int64))
+                pixels.append(inlier_columns(found, "uv"))
                 rows.append(row)
         done()
     counts = [len(of) for of in points]
@@ -79,35 +83,14 @@ def track_on_map(
     return np.array(rows, np.int64), shown, Start(start.points, rotations, positions)
 
 
-class _MapTracker:
-    """One view after the other, as the node takes keypoints."""
-
-    def __init__(self, landmarks: Map, camera: Camera) -> None:
-        self._matcher = Matcher(landmarks)
-        self._localizer = Localizer(camera, NodeConfig(inlier_threshold=_THRESHOLD))
-        self._tracker = Tracker(self._localizer) if camera.readout_time > 0.0 else None
-        self._camera = camera
-
-    def localize(self, view: SeenImage) -> tuple[Estimate | Failure, Matches]:
-        features = view.features
-        keypoints = Keypoints(
-            view.stamp_ns, features.pixels, None, features.descriptors, features.scores, 0
-        )
-        if self._tracker is not None:
-            prior = self._tracker.prediction(view.stamp_ns)
-            if prior is not None:
-                estimate, matches = self._match(keypoints, prior)
-                if estimate:
-                    return estimate, matches
-        return self._match(keypoints, None)
-
-    def _match(
-        self, keypoints: Keypoints, prior: Prior | None
-    ) -> tuple[Estimate | Failure, Matches]:
-        matches = self._matcher.match(keypoints, self._camera, prior)
-        points = self._matcher.map.points[matches.landmarks]
-        cloud = (points, keypoints.pixels[matches.keypoints], matches.scores)
-        if self._tracker is None:
-            return self._localizer.localize(*cloud), matches
-        # The time from image to image is all that counts, not the row.
-        return self._tracker.localize(keypoints.stamp_ns, *cloud), matches
+def _frames(structure: Structure, camera: Camera) -> CameraFrames:
+    """Return what localizes keypoints on the structure, as the node does."""
+    config = NodeConfig(
+        inlier_threshold=_THRESHOLD, readout_time=camera.readout_time,
+        scan_direction=str(camera.scan_direction),
+    )  # fmt: skip
+    frames = CameraFrames(config)
+    frames.calibrate(read_camera_info(make_camera_info(camera, 0)))
+    points = structure.start.points
+    frames.use_map(Map(points, np.arange(len(points)), structure.descriptors, MAP_FRAME))
+    return frames
