@@ -2,22 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames with a known turn: the truth comes back whatever shakes, and nothing changes without."""
 
-from dataclasses import fields
 
 import numpy as np
 import pytest
 
-from rs_localizer.core.reasons import ImuReason, Unused
 from rs_localizer.core.rotation_prior import ROTATION
 from rs_localizer.core.shake import COMBINATIONS, MIDDLE_RATES, MIDDLE_VALUES, shake_functions
 from rs_localizer.core.so3 import log
-from rs_localizer.core.types import Estimate
 from rs_localizer.inertial.gyro_prior import GyroscopeTrack
 from rs_localizer.inertial.status import InertialSettings
 from rs_localizer.inertial.turning import BETWEEN, GyroscopeErrors, read
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
-from rs_localizer.tracking import Tracker
 
 from .conftest import MIDDLE_NS, READOUT_TIME, Shaken
 
@@ -62,19 +58,6 @@ def test_the_truth_comes_back_under_vibration(camera, solver):
         assert np.degrees(np.abs(twist.angular - shaken.rate(tau * READOUT_TIME)).max()) < 0.1
         expected = rotation.inv().apply(shaken.velocity)
         np.testing.assert_allclose(twist.linear, expected, atol=2e-3)
-
-
-def test_velocities_are_the_derivatives_of_the_poses(camera):
-    shaken = Shaken()
-    points, pixels = shaken.frame(camera)
-    found = Localizer(camera).localize(points, pixels, rotation=known(shaken.samples(), errors()))
-    step = 1e-5
-    rotations, translations = found.at_rows(np.array([0.2 - step, 0.2, 0.2 + step]))
-    turned = log(np.ascontiguousarray(rotations[0] @ rotations[2].T)) / (2.0 * step)
-    np.testing.assert_allclose(found.angular_velocity_at(0.2), turned, atol=1e-6)
-    centres = -np.einsum("nji,nj->ni", rotations, translations)
-    moved = rotations[1] @ (centres[2] - centres[0]) / (2.0 * step)
-    np.testing.assert_allclose(found.linear_velocity_at(0.2), moved, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -122,27 +105,3 @@ def test_a_vibration_of_unknown_phase_is_no_rotation_that_is_known():
     swing = 2.0 * np.sin(np.pi * 60.0 * READOUT_TIME) * np.radians(0.3) / np.sqrt(2.0)
     assert np.trace(turns[0]) < (0.05 * swing) ** 2
     assert np.trace(turns[1]) == pytest.approx(swing**2, rel=0.3)
-
-
-def test_without_samples_everything_is_as_without_a_gyroscope(camera):
-    # A gentle vibration: of the same image three times a stronger one is refused, twice alike.
-    points, pixels = Shaken(vibration=0.1).frame(camera)
-    pixels = pixels + np.random.default_rng(0).normal(0.0, 0.5, pixels.shape)
-    alone, aided = (
-        Tracker(Localizer(camera)),
-        Tracker(Localizer(camera), GyroscopeTrack(SETTINGS, READOUT_TIME)),
-    )
-    assert alone.aid is None
-    for k in range(3):
-        time_ns = MIDDLE_NS + 33_000_000 * k
-        one, other = (
-            alone.localize(time_ns, points, pixels),
-            aided.localize(time_ns, points, pixels),
-        )
-        for field in fields(Estimate):
-            a, b = getattr(one, field.name), getattr(other, field.name)
-            parts = zip(a, b, strict=True) if field.name == "scales" else [(a, b)]
-            assert all(
-                np.array_equal(x, y, equal_nan=field.name == "residuals") for x, y in parts
-            ), field.name
-        assert aided.aid.status.unused == Unused(ImuReason.LATE)
