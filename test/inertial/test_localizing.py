@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames with a known turn: the truth comes back whatever shakes, and nothing changes without."""
 
-
 import numpy as np
 import pytest
 

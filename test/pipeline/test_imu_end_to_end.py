@@ -6,7 +6,6 @@ The world is the test's own: SciPy's rotations, a motion of sines, and a pinhole
 """
 
 from collections.abc import Callable
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.config import Imu, NodeConfig
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.imu import read_imu
+from rs_localizer.io.imu import ImuReading
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.transforms import Transform, TransformTree, make_transform
 from rs_localizer.pipeline.camera_frames import CameraFrames
@@ -79,21 +78,6 @@ def cloud(seconds: float, stamp_offset: float, direction: str, rng: np.random.Ge
     return cloud_of(START_NS + round(1e9 * seconds), points, pixels + noise)
 
 
-def measured(stamp_ns: int, rate: Array) -> SimpleNamespace:
-    """A sensor_msgs/Imu without accelerometer and covariances."""
-    stamp = SimpleNamespace(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-    nothing = SimpleNamespace(x=0.0, y=0.0, z=0.0)
-    return SimpleNamespace(
-        header=SimpleNamespace(stamp=stamp, frame_id="imu"),
-        orientation=SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0),
-        orientation_covariance=np.zeros(9),
-        angular_velocity=SimpleNamespace(**dict(zip("xyz", map(float, rate), strict=True))),
-        angular_velocity_covariance=np.zeros(9),
-        linear_acceleration=nothing,
-        linear_acceleration_covariance=np.zeros(9),
-    )
-
-
 def errors_of(found: Localized | Refusal | None) -> list[float]:
     """Errors of turn, place, turn rate and velocity, and squared distances of pose and twist."""
     assert isinstance(found, Localized), found
@@ -123,19 +107,11 @@ def test_pose_and_twist_are_right_whatever_is_turned_or_late(
     mounting = Transform(CAMERA_FROM_IMU.as_matrix(), np.array([0.1, 0.2, 0.3]))
     transform = make_transform(make_message, 0, "camera", "imu", mounting)
     tree.add(make_message("tf2_msgs/msg/TFMessage", transforms=[transform]), static=True)
-    config = NodeConfig(
-        readout_time=READOUT_TIME,
-        scan_direction=direction,
-        stamp_offset=stamp_offset,
-        output_lag=lag,
-        # Of an IMU that is calibrated: a hundredth of the scale is 1.1 deg/s of this vibration.
-        imu=Imu(
-            time_offset=IMU_OFFSET,
-            time_offset_deviation=1e-4,
-            scale_deviation=1e-3,
-            mount_deviation=1e-3,
-        ),
-    )
+    # Of an IMU that is calibrated: a hundredth of the scale is 1.1 deg/s of this vibration.
+    imu = Imu(time_offset=IMU_OFFSET, time_offset_deviation=1e-4, scale_deviation=1e-3,
+              mount_deviation=1e-3)  # fmt: skip
+    config = NodeConfig(readout_time=READOUT_TIME, scan_direction=direction,
+                        stamp_offset=stamp_offset, output_lag=lag, imu=imu)  # fmt: skip
     localizer = CameraFrames(config, transforms=tree)
     K = np.array([[FOCAL, 0.0, CENTRE[0]], [0.0, FOCAL, CENTRE[1]], [0.0, 0.0, 1.0]])
     localizer.calibrate(read_camera_info(make_camera_info(k=K.ravel())))
@@ -148,7 +124,7 @@ def test_pose_and_twist_are_right_whatever_is_turned_or_late(
             noise = rng.normal(scale=2e-4 * np.sqrt(IMU_RATE), size=3)
             rate = CAMERA_FROM_IMU.inv().apply(turn_rate(now)) + BIAS + noise
             stamp_ns = START_NS + round(1e9 * (heard - IMU_OFFSET))
-            localizer.aid.add(read_imu(measured(stamp_ns, rate)))
+            localizer.aid.add(ImuReading(stamp_ns, "imu", tuple(rate.tolist()), None))
             heard += 1.0 / IMU_RATE
         found = localizer.localize(cloud(seconds, stamp_offset, direction, rng))
         if index >= lag:

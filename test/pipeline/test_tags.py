@@ -48,18 +48,13 @@ def array(kind: str, header: Any, tags: list[tuple[str, int, np.ndarray]]) -> An
             more = {"hamming": 0, "goodness": 0.0, "decision_margin": 50.0, "centre": middle}
             more["homography"] = np.eye(3).ravel()
         else:
+            geometry = "geometry_msgs/msg"
+            turn = make_message(f"{geometry}/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+            pose = make_message(f"{geometry}/Pose", position=at(0, 0), orientation=turn)
             pose = make_message(
-                "geometry_msgs/msg/Pose",
-                position=at(0, 0), orientation=make_message(
-                    "geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0
-                ),
-            )  # fmt: skip
-            pose = make_message(
-                "geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)
+                f"{geometry}/PoseWithCovariance", pose=pose, covariance=np.zeros(36)
             )
-            pose = make_message(
-                "geometry_msgs/msg/PoseWithCovarianceStamped", header=header, pose=pose
-            )
+            pose = make_message(f"{geometry}/PoseWithCovarianceStamped", header=header, pose=pose)
             more = {"center": middle, "pose": pose}
         return make_message(f"{package}/msg/AprilTagDetection", **common, **more)
 
@@ -87,13 +82,10 @@ def of_apriltag(walls: Path) -> list[Any]:
     library = pytest.importorskip("pupil_apriltags", reason="needs pupil-apriltags")
     detector = library.Detector(families=FAMILY, quad_decimate=1.0)
     found = [
-        array(
-            APRILTAG_TYPE,
-            header,
-            [(FAMILY, tag.tag_id, tag.corners) for tag in detector.detect(image)],
-        )
+        array(APRILTAG_TYPE, header,
+              [(FAMILY, tag.tag_id, tag.corners) for tag in detector.detect(image)])
         for header, image in images(walls)
-    ]
+    ]  # fmt: skip
     # Its destructor frees families and then the detector, which uses them: a broken heap.
     detector.tag_families.clear()
     return found
@@ -116,27 +108,18 @@ def test_pixels_and_corners_are_those_of_our_own_detector(walls: Path) -> None:
     assert np.median(np.linalg.norm(apart, axis=1)) < 0.4
 
 
+def camera_info(walls: Path) -> Any:
+    with open_bag(walls) as bag:
+        (topic,) = (t for t, kind in bag.topics.items() if kind.endswith("CameraInfo"))
+        return next(iter(bag.messages([topic])))[2]
+
+
 def localizer(walls: Path, notices: list[tuple[str, str]]) -> CameraFrames:
     config = NodeConfig(readout_time=READOUT, marker_map=str(walls / "marker_map.yaml"))
     made = CameraFrames(config, lambda name, text: notices.append((name, text)))
     made.load_files()
-    with open_bag(walls) as bag:
-        (topic,) = (t for t, kind in bag.topics.items() if kind.endswith("CameraInfo"))
-        _, _, info = next(iter(bag.messages([topic])))
-    made.calibrate(read_camera_info(info))
+    made.calibrate(read_camera_info(camera_info(walls)))
     return made
-
-
-def written(walls: Path, path: Path, messages: list[Any]) -> Path:
-    """A recording of detections and camera_info."""
-    with open_bag(walls) as bag, BagWriter(path) as writer:
-        (topic,) = (t for t, kind in bag.topics.items() if kind.endswith("CameraInfo"))
-        for _, stamp_ns, info in bag.messages([topic]):
-            writer.write("/camera_info", info, stamp_ns)
-        for message in messages:
-            stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-            writer.write("/detections", message, stamp_ns)
-    return path
 
 
 @cache
@@ -201,6 +184,8 @@ def test_what_cannot_be_used_is_refused(walls: Path, tmp_path: Path, capsys: Any
             SimpleNamespace(header=header, detections=[SimpleNamespace(corners=[1, 2, 3])])
         )
     assert isinstance(CameraFrames(NodeConfig()).localize_detections(None), Refusal)
-    path = written(walls, tmp_path / "tags", [array(APRILTAG_TYPE, header, tags)])
-    assert main(["replay", str(path), "--out", str(tmp_path / "out")]) == 1
+    with BagWriter(tmp_path / "tags") as bag:
+        bag.write("/camera_info", camera_info(walls), 10**9)
+        bag.write("/detections", array(APRILTAG_TYPE, header, tags), 2 * 10**9)
+    assert main(["replay", str(tmp_path / "tags"), "--out", str(tmp_path / "out")]) == 1
     assert "-p marker_map:=FILE says where tags are" in capsys.readouterr().err

@@ -1,12 +1,10 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo as a user starts it, with a few frames; and Ctrl-C."""
+"""The demo as a user starts it, with a few frames."""
 
 import re
-import signal
 import subprocess
 import sys
-import time
 
 import cv2
 
@@ -37,17 +35,3 @@ def test_quick_demo(tmp_path):
     assert [file.name for file in out.iterdir()] == ["flight_errors.png"]
     assert "has answered 12 of 12 frames as above to the last bit" in demo.stdout
     assert re.match("next: .*markers make board --help", demo.stdout.splitlines()[-1])
-
-
-def test_a_signal_ends_it_in_a_line(tmp_path):
-    with (tmp_path / "log").open("w") as log:
-        demo = subprocess.Popen(
-            [*DEMO, "--all", "--out", str(tmp_path / "out")],
-            stdout=log, stderr=log, start_new_session=True,
-        )  # fmt: skip
-    while "Walls of markers, 12 frames: linear velocity" not in (tmp_path / "log").read_text():
-        assert demo.poll() is None, (tmp_path / "log").read_text()
-        time.sleep(0.02)
-    demo.send_signal(signal.SIGINT)
-    assert demo.wait() == 130
-    assert (tmp_path / "log").read_text().endswith("rs_localizer demo: interrupted\n")
