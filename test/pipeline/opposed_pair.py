@@ -3,7 +3,7 @@
 """A recording of two cameras with opposed scans before a wall."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -74,24 +74,18 @@ def rich(motion: TrueMotion) -> np.ndarray:
 def record(
     path: Path,
     seconds: float = 1.0,
-    noise: float = 0.5,
     keep: Callable[[RigFrame], bool] = lambda image: True,
-    names: tuple[str, ...] = ("left", "right"),
     motion: TrueMotion | None = None,
     points: np.ndarray | None = None,
     true: RigParts = PARTS,
-    stamp: Callable[[RigFrame], int] = lambda image: image.stamp_ns,
-    **parameters: Any,
 ) -> TrueMotion:
     """Write a recording with its parameters; the true motion of the rig.
 
     ``true``: the rig as it is, where it differs from what the recording says.
     """
     motion = motion or ConstantVelocity(ANGULAR, LINEAR, seconds, start_ns=1_000_000_000)
-    settings = FrameSettings(points=80, noise=noise, outliers=0.2)
-    parts = PARTS._replace(cameras={name: PARTS.cameras[name] for name in names})
-    true = true._replace(cameras=parts.cameras)
-    stamps = camera_stamps(parts, motion, settings.rate, seed=4)
+    settings = FrameSettings(points=80, noise=0.5, outliers=0.2)
+    stamps = camera_stamps(PARTS, motion, settings.rate, seed=4)
     points = wall() if points is None else points
 
     def see(name: str, mounted: TrueMotion, seed: int) -> Any:
@@ -101,9 +95,9 @@ def record(
         )
 
     with BagWriter(path) as bag:
-        bag.write("/tf_static", make_mounts(parts), motion.intervals_ns[0][0] - 100_000_000)
+        bag.write("/tf_static", make_mounts(PARTS), motion.intervals_ns[0][0] - 100_000_000)
         for image in simulate_rig(true, motion, see):
             if keep(image):
-                write_rig_frame(bag, parts, motion, replace(image, stamp_ns=stamp(image)))
-    write_parameters(path / "parameters.yaml", rig_parameters(parts) | parameters)
+                write_rig_frame(bag, PARTS, motion, image)
+    write_parameters(path / "parameters.yaml", rig_parameters(PARTS))
     return motion

@@ -12,9 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.config import DetectorConfig, NodeConfig
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.images import Image
 from rs_localizer.localizer import Localizer
 from rs_localizer.markers.dictionaries import pattern
@@ -23,6 +21,8 @@ from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.marker_detector import FrameDetector
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.pipeline.what_fits import Mistakes, mistake_of, of_refused, what_fits
+
+from .clouds import cloud_of
 
 K = np.array([[500.0, 0.0, 319.5], [0.0, 510.0, 239.5], [0.0, 0.0, 1.0]])
 READOUT = 0.03
@@ -120,10 +120,7 @@ def test_a_day_of_refusals_costs_ten_tries():
 
 
 def cloud(t, pixels):
-    rows = np.empty(40, [(name, "<f8") for name in "xyzuv"])
-    for name, column in zip("xyzuv", [*corners().T, *pixels.T], strict=True):
-        rows[name] = column
-    return make_cloud(make_message, round((5.0 + t) * 1e9), "map", rows)
+    return cloud_of(round((5.0 + t) * 1e9), corners(), pixels)
 
 
 def test_node_and_replay_say_it(make_camera_info):
