@@ -80,17 +80,18 @@ def parts(names: set[str]) -> set[str]:
     return below & here | public
 
 
+def modules() -> Iterator[tuple[str, tuple[str, ...], set[str]]]:
+    """The file of each module in the package, its dotted name in parts, and what it imports."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        name = path.relative_to(PACKAGE.parent).with_suffix("").parts
+        yield str(path.relative_to(PACKAGE)), name, imported(path.read_text(), ".".join(name[:-1]))
+
+
 def test_imports_go_down_only():
     wrong = []
-    for path in sorted(PACKAGE.rglob("*.py")):
-        where = path.relative_to(PACKAGE.parent).with_suffix("").parts
-        part = where[1]
-        names = imported(path.read_text(), ".".join(where[:-1]))
+    for file, (_, part, *_), names in modules():
         used = parts(names) - {part} | {name for name in names if name.startswith("benchmarks")}
-        wrong += [
-            f"{path.relative_to(PACKAGE.parent)} imports {bad}"
-            for bad in sorted(used - MAY_IMPORT[part])
-        ]
+        wrong += [f"{file} imports {bad}" for bad in sorted(used - MAY_IMPORT[part])]
     assert wrong == []
 
 
@@ -115,14 +116,9 @@ ONLY_IN = {
 def test_what_few_need_is_imported_where_they_need_it():
     packages = {name: places for names, places in ONLY_IN.items() for name in names}
     wrong = []
-    for path in sorted(PACKAGE.rglob("*.py")):
-        where = str(path.relative_to(PACKAGE))
-        used = {name.partition(".")[0] for name in imported(path.read_text(), "")}
-        wrong += [
-            f"{where} imports {name}"
-            for name in sorted(used & packages.keys())
-            if not where.startswith(packages[name])
-        ]
+    for file, _, names in modules():
+        used = {name.partition(".")[0] for name in names} & packages.keys()
+        wrong += [f"{file} imports {name}" for name in used if not file.startswith(packages[name])]
     assert wrong == []
 
 
@@ -134,14 +130,10 @@ def test_a_localizer_loads_nothing_that_few_need():
     """
     apart = ("tools/", "cli/", "ros/", "native/", "__main__", *TRACED, "io/maps/colmap_process.py")
     apart += ("inertial/",)
-    modules = [
-        ".".join(("rs_localizer", *path.relative_to(PACKAGE).with_suffix("").parts))
-        for path in sorted(PACKAGE.rglob("*.py"))
-        if not str(path.relative_to(PACKAGE)).startswith(apart)
-    ]
+    loaded = [".".join(name) for file, name, _ in modules() if not file.startswith(apart)]
     names = ["rs_localizer.inertial", *(name for names in ONLY_IN for name in names)]
     code = (
-        f"import importlib, sys\nfor name in {modules}:\n    importlib.import_module(name)\n"
+        f"import importlib, sys\nfor name in {loaded}:\n    importlib.import_module(name)\n"
         f"print(*[name for name in {names} if name in sys.modules])"
     )
     done = subprocess.run(
@@ -164,24 +156,18 @@ def test_nodes_do_not_know_each_other():
     folders = {path.name for path in ros.iterdir() if (path / "__init__.py").is_file()}
     assert folders == set(ROS_MAY_IMPORT)
     wrong = []
-    for folder in sorted(folders):
-        for path in sorted((ros / folder).rglob("*.py")):
-            where = path.relative_to(PACKAGE.parent).with_suffix("").parts
-            names = imported(path.read_text(), ".".join(where[:-1]))
+    for file, (_, part, folder, *_), names in ((f, (*n, ""), i) for f, n, i in modules()):
+        if part == "ros" and folder in folders:
             used = {name.split(".")[2] for name in names if name.startswith("rs_localizer.ros.")}
             bad = (used & folders) - ROS_MAY_IMPORT[folder] - {folder}
-            wrong += [f"{path.relative_to(PACKAGE.parent)} imports ros.{name}" for name in bad]
+            wrong += [f"{file} imports ros.{name}" for name in bad]
     assert wrong == []
 
 
 def test_every_module_has_a_client() -> None:
     """Imported, or named where it is imported late; commands are found by their names."""
     texts = {path: path.read_text() for path in PACKAGE.rglob("*.py")}
-    names = {
-        name
-        for path, text in texts.items()
-        for name in imported(text, ".".join(path.relative_to(PACKAGE.parent).parts[:-1]))
-    }
+    names = {name for *_, used in modules() for name in used}
     root = PACKAGE.parent
     starts = [path.read_text() for path in (root / "setup.py", *root.glob("launch/*.py"))]
     orphans = []

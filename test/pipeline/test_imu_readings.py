@@ -107,9 +107,8 @@ def fly(
     config: NodeConfig = CONFIG,
     mounting: Any = None,
     most: int = 1000,
-    late: float = 0.0,
 ) -> Flown:
-    """Localize a flight, or so many of its frames; nobody waits for readings that are late (s)."""
+    """Localize a flight, or so many of its frames."""
     flown = Flown(flight)
     tree = TransformTree()
     if mounting is not False:
@@ -117,10 +116,7 @@ def fly(
     frames = CameraFrames(config, lambda name, _: flown.notices.update((name,)), tree)
 
     def changed() -> Iterable[Item]:
-        comes = {"/imu": round(1e9 * late)}
-        for topic, recorded_ns, message in sorted(
-            flight.items, key=lambda item: item[1] + comes.get(item[0], 0)
-        ):
+        for topic, recorded_ns, message in flight.items:
             if topic != "/imu":
                 yield topic, recorded_ns, message
                 continue
@@ -128,7 +124,7 @@ def fly(
                 yield topic, recorded_ns, item
 
     def awaits(item: Item) -> bool:
-        frame = item[0] == "/correspondences" and not late
+        frame = item[0] == "/correspondences"
         return frame and frames.awaits_readings(stamp_ns(item[2]), 1.0)
 
     for topic, _, message in imu_first(changed(), "/imu", awaits):
