@@ -68,3 +68,9 @@ def fitted(observations, start, prior, threshold):
 def distance(posterior, truth, parts):
     error = step_between(posterior.state, truth)[parts]
     return error @ np.linalg.solve(posterior.covariance[parts, parts], error)
+
+
+def alike(found, expected, scale, **within):
+    """Assert that vectors (n,) or matrices (n,n) are equal in units of deviations (n,)."""
+    units = scale if np.ndim(found) == 1 else np.outer(scale, scale)
+    np.testing.assert_allclose(found / units, expected / units, **within)

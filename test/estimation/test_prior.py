@@ -110,10 +110,8 @@ def test_a_motion_prior_costs_the_mahalanobis_distance_about_its_pivot(size):
         ({"motion": motion(), "covariance": np.eye(6)},
          r"must be \(12,12\) or \(18,18\), got \(6, 6\)"),
         ({"motion": motion(), "covariance": np.zeros((12, 12))}, "must be positive definite"),
-        ({"motion": motion(), "covariance": np.triu(np.ones((12, 12)))}, "must be symmetric"),
         ({"motion": replace(motion(), rotation=2 * np.eye(3)), "covariance": np.eye(12)},
          "rotation is not orthonormal"),
-        ({"angular_velocity": [1, 2]}, "angular_velocity must be three finite numbers"),
         ({"gravity": [0, 0, 0], "gravity_deviation": 1}, "gravity has no direction"),
     ],
 )  # fmt: skip

@@ -20,6 +20,8 @@ from rs_localizer.estimation.window import (
     told_of,
 )
 
+from .frames import alike
+
 FADING, PERIOD = 0.03, 1.0 / 30.0  # s
 SPAN = 0.03
 STILL = np.concatenate([np.eye(3).ravel(), np.zeros(15)])
@@ -121,13 +123,8 @@ def test_it_is_least_squares_over_all_its_frames():
     scale = np.sqrt(np.diag(covariances[-1]))
     for k in range(LENGTH):
         found = window.before(len(samples) - k)
-        np.testing.assert_allclose(
-            step_between(STILL, found.state) / scale, means[k] / scale, atol=0.03
-        )
-        np.testing.assert_allclose(
-            found.covariance / np.outer(scale, scale),
-            covariances[k] / np.outer(scale, scale), atol=0.01, rtol=0.01,
-        )  # fmt: skip
+        alike(step_between(STILL, found.state), means[k], scale, atol=0.03)
+        alike(found.covariance, covariances[k], scale, atol=0.01, rtol=0.01)
         assert found.time_ns == (0 if k == 0 else samples[k - 1].time_ns)
 
 
@@ -173,11 +170,7 @@ def test_between_frames_it_passes_through_both_and_after_them_it_spreads():
     for near, frame in ((before.time_ns + 1000, before), (last.time_ns - 1000, last)):
         found = window.at(near)
         np.testing.assert_allclose(found.state, frame.state, atol=1e-3 * SMALL)
-        scale = np.sqrt(np.diag(frame.covariance))
-        np.testing.assert_allclose(
-            found.covariance / np.outer(scale, scale), frame.covariance / np.outer(scale, scale),
-            atol=0.02,
-        )  # fmt: skip
+        alike(found.covariance, frame.covariance, np.sqrt(np.diag(frame.covariance)), atol=0.02)
     middle = window.at((before.time_ns + last.time_ns) // 2)
     turn = step_between(before.state, middle.state)[:3]
     halfway = 0.5 * step_between(before.state, last.state)[:3]
@@ -217,10 +210,7 @@ def test_points_tell_what_the_posterior_knows_beside_its_prior():
     posterior = np.linalg.inv(information + before)
     sample = told_of(estimate(posterior @ gradient, posterior), 7, known)
     scale = np.sqrt(np.diag(information + before))
-    np.testing.assert_allclose(
-        sample.information / np.outer(UNITS * scale, UNITS * scale),
-        information / np.outer(scale, scale), atol=2e-3,
-    )  # fmt: skip
+    alike(sample.information / np.outer(UNITS, UNITS), information, scale, atol=2e-3)
     # The gradient at the estimate: the points pull as much as the prior holds.
     left = gradient - information @ (posterior @ gradient)
     np.testing.assert_allclose(
