@@ -20,13 +20,13 @@ K = np.array([[400.0, 0.0, 319.5], [0.0, 400.0, 239.5], [0.0, 0.0, 1.0]])
 DIRECTIONS = ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"]
 
 
-def some_motion(seed=0, speed=0.3, acceleration=0.0):
+def some_motion(seed=0, acceleration=0.0):
     rng = np.random.default_rng(seed)
     return Motion(
         Rotation.random(random_state=seed).as_matrix(),
         np.array([0.1, -0.2, 3.0]),
-        speed * rng.normal(size=3),
-        speed * rng.normal(size=3),
+        0.3 * rng.normal(size=3),
+        0.3 * rng.normal(size=3),
         angular_acceleration=acceleration * rng.normal(size=3),
         linear_acceleration=acceleration * rng.normal(size=3),
     )

@@ -20,20 +20,20 @@ from rs_localizer.estimation.robust import apply_step
 CENTRE = np.array([10.0, -3.0, 2.0])
 
 
-def motion(seed=0):
-    rng = np.random.default_rng(seed)
+def motion():
+    rng = np.random.default_rng(0)
     pose = so3.exp(rng.normal(size=3)), *rng.normal(size=(3, 3))
     angular, linear = rng.normal(size=(2, 3))
     return Motion(*pose, angular_acceleration=angular, linear_acceleration=linear)
 
 
-def covariance(seed=1, size=18):
-    factor = np.random.default_rng(seed).normal(size=(size, size))
+def covariance(size=18):
+    factor = np.random.default_rng(1).normal(size=(size, size))
     return factor @ factor.T / size + 0.1 * np.eye(size)
 
 
-def evaluate(terms, state, weight=1.0, size=18):
-    information, slope = np.zeros((size, size)), np.zeros(size)
+def evaluate(terms, state, weight=1.0):
+    information, slope = np.zeros((18, 18)), np.zeros(18)
     return add_prior(terms, state, weight, information, slope), information, slope
 
 

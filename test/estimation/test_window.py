@@ -181,14 +181,13 @@ def test_between_frames_it_passes_through_both_and_after_them_it_spreads():
     assert window.at(window.start.time_ns - 1) is None
 
 
-def estimate(step, joint, shake=None):
+def estimate(step, joint):
     state = apply_step(STILL, step)
     return Estimate(
         state[:9].reshape(3, 3), state[9:12], state[12:15], state[15:18],
         angular_acceleration=state[18:21], linear_acceleration=state[21:],
         inliers=np.ones(5, bool), residuals=np.zeros(5), joint_covariance=joint,
         iterations=0, span=SPAN,
-        shake=np.zeros((0, 3)) if shake is None else shake,
     )  # fmt: skip
 
 

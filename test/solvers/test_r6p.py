@@ -59,12 +59,12 @@ def problems(h, seed, *, rotation=30.0, translation=0.3, error=6.0, noise=0.0):
     return SimpleNamespace(**{name: x[settled] for name, x in problem.items()})
 
 
-def solutions(p, limit=1e-9):
+def solutions(p):
     """Samples (m,) and v (m,3), before I + [v]x is replaced by the nearest rotation."""
     found = r6p.find_solutions(p.points, p.rays, p.tau, BOUND)
     of = found.sample
     one = SimpleNamespace(points=p.points[of], rays=p.rays[of], tau=p.tau[of])
-    assert np.abs(residuals(one, found.v, found.c, found.w, found.t)).max() < limit
+    assert np.abs(residuals(one, found.v, found.c, found.w, found.t)).max() < 1e-9
     return of, found.v
 
 

@@ -20,9 +20,9 @@ TO_MAP = Similarity(
 HELD = Rotation.from_euler("YX", [[a, b] for a in (0, 50, 200) for b in (-20, 5)], degrees=True)
 
 
-def found(points: np.ndarray, counts: int = 9) -> Triangulated:
+def found(points: np.ndarray) -> Triangulated:
     count = len(points)
-    return Triangulated(points, np.tile(np.eye(3), (count, 1, 1)), np.full(count, counts), 0.1)
+    return Triangulated(points, np.tile(np.eye(3), (count, 1, 1)), np.full(count, 9), 0.1)
 
 
 def back(points: np.ndarray) -> np.ndarray:
@@ -30,8 +30,8 @@ def back(points: np.ndarray) -> np.ndarray:
     return (points - TO_MAP.translation) @ TO_MAP.rotation / TO_MAP.scale
 
 
-def placed(anchors: Anchors, points: np.ndarray, counts: int = 9):
-    return placement(anchors, found(points, counts), HELD.as_matrix(), np.zeros((6, 3)))
+def placed(anchors: Anchors, points: np.ndarray):
+    return placement(anchors, found(points), HELD.as_matrix(), np.zeros((6, 3)))
 
 
 def test_markers_give_frame_and_scale():

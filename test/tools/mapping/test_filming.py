@@ -13,11 +13,11 @@ from rs_localizer.tools.mapping.report import comes_back
 from rs_localizer.tools.mapping.seen_images import SeenImage, choose_keyframes
 
 
-def views_of(sharpnesses: list[float], rate: float = 15.0) -> list[SeenImage]:
+def views_of(sharpnesses: list[float]) -> list[SeenImage]:
     nothing = Features(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 128), np.uint8))
     none = np.zeros(0, np.int64)
     return [
-        SeenImage(round(k * 1e9 / rate), Path(), nothing, value, np.zeros((0, 2)), none)
+        SeenImage(round(k * 1e9 / 15.0), Path(), nothing, value, np.zeros((0, 2)), none)
         for k, value in enumerate(sharpnesses)
     ]
 

@@ -15,7 +15,7 @@ from rs_localizer.tools.simulation.simulated_frames import (
     simulate_frames,
 )
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings
-from rs_localizer.tools.simulation.true_motion import ConstantVelocity, RecordedMotion, TrueMotion
+from rs_localizer.tools.simulation.true_motion import ConstantVelocity, RecordedMotion
 
 K = np.array([[400.0, 0.0, 319.5], [0.0, 410.0, 239.5], [0.0, 0.0, 1.0]])
 MOTION = ConstantVelocity(np.array([0.6, -2.0, 1.5]), np.array([1.0, 0.5, 0.25]), 1.0)
@@ -27,10 +27,8 @@ def camera(direction: str = "top_to_bottom") -> Camera:
     return Camera(640, 480, K, readout_time=0.03, scan_direction=direction)
 
 
-def frames(
-    settings: FrameSettings = CLEAN, motion: TrueMotion = MOTION, direction: str = "top_to_bottom"
-) -> list[SimulatedFrame]:
-    return list(simulate_frames(camera(direction), motion, MAP, settings))
+def frames(direction: str = "top_to_bottom") -> list[SimulatedFrame]:
+    return list(simulate_frames(camera(direction), MOTION, MAP, CLEAN))
 
 
 @pytest.mark.parametrize("direction", list(ScanDirection))
