@@ -19,10 +19,6 @@ TAU = np.linspace(-0.8, 0.8, 33)
 ROWS = np.linspace(-0.5, 0.5, 7)
 
 
-def shaking(tau):
-    return 0.3 * np.column_stack([np.sin(9.0 * tau), np.cos(5.0 * tau), 0.4 + tau])
-
-
 def integrated(rate, tau):
     """Rotation (3,3) camera_then_from_camera_at_0 of a body rate."""
 
@@ -35,7 +31,8 @@ def integrated(rate, tau):
 
 def known():
     """The rotation with these rates, by its turns at the nodes."""
-    spline = CubicSpline(TAU, shaking(TAU), bc_type="natural")
+    shaking = 0.3 * np.column_stack([np.sin(9.0 * TAU), np.cos(5.0 * TAU), 0.4 + TAU])
+    spline = CubicSpline(TAU, shaking, bc_type="natural")
     turns = np.array([integrated(spline, tau) for tau in NODES])
     return RotationPrior(*parts_of(turns), np.zeros((WHOLE, WHOLE)), False), spline
 

@@ -100,14 +100,11 @@ def test_the_columns_of_the_table_of_frames() -> None:
     assert said == list(COLUMNS.items())
 
 
-def taken_topics() -> Any:
-    return LocalizerNode.topics(Mock(), NodeConfig())
-
-
 def test_the_topics_of_the_localizer():
     (table,) = [t for t in pages.all_tables("topic or service") if t.page == "docs/node.md"]
     said = {pages.names_in(row[1])[0]: (row[0], row[2]) for row in table.rows}
-    taken = {name: topic.type for name, topic in taken_topics().items()}
+    of_node: Any = LocalizerNode.topics(Mock(), NodeConfig())
+    taken = {name: topic.type for name, topic in of_node.items()}
     # Their packages are not installed everywhere; the node then does without.
     optional = {name: item for name, item in INPUTS.items() if item.also}
     assert {name for name, (way, _) in said.items() if way == "in"} == {*taken, *optional}

@@ -131,11 +131,6 @@ def test_of_very_many_points_rounding_leaves_none_out():
         np.testing.assert_array_equal(found.inliers, again.inliers)
 
 
-def is_refused(posterior):
-    failure = refusal(posterior, 0, min_inliers=12, threshold=2.0, rolling=True)
-    return failure is not None
-
-
 @pytest.mark.parametrize(
     ("count", "wrong", "published"),
     [
@@ -154,7 +149,7 @@ def test_few_points_of_a_vibrating_camera_are_refused_or_covered(count, wrong, p
         observations, state = shaken(seed, 3.0, 2.0 * SWING, 0.5, wrong, count)
         start = fitted(observations, state, PRIOR, 8.0)
         found = frame_posterior(observations, start.state, PRIOR, 2.0, ASSUMED)
-        if is_refused(found):
+        if refusal(found, 0, min_inliers=12, threshold=2.0, rolling=True) is not None:
             continue
         squared.append(distance(found, at_the_middle(state, 3.0, 2.0 * SWING), slice(0, 12)))
     assert len(squared) >= published

@@ -29,11 +29,10 @@ def printed(one: Family) -> Any:
     return np.pad(np.array(bits, bool).reshape(one.bits, one.bits), one.border)
 
 
-def available() -> list[str]:
-    return [name for name, one in FAMILIES.items() if hasattr(cv2.aruco, one.constant)]
+AVAILABLE = [name for name, one in FAMILIES.items() if hasattr(cv2.aruco, one.constant)]
 
 
-@pytest.mark.parametrize("name", available())
+@pytest.mark.parametrize("name", AVAILABLE)
 def test_corners_of_every_family_are_those_of_the_upright_print(name):
     marker = Marker.at(name, 0, SIZE)
     detector = MarkerDetector(MarkerMap((marker,)))

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.aided import believed
 from benchmarks.independent.cameras import Camera
-from benchmarks.independent.frames import Frames, simulate
+from benchmarks.independent.frames import simulate
 from benchmarks.independent.motions import Motions, States, hand
 from benchmarks.independent.scenes import Rich
 from rs_localizer.config import NodeConfig
@@ -51,10 +51,6 @@ def level(count: int, rng: np.random.Generator) -> Motions:
     yaw = np.outer(rng.uniform(-np.pi, np.pi, count), [0.0, 0.0, 1.0])
     rotation = Rotation.from_rotvec(yaw).as_matrix() @ BODY_FROM_CAMERA
     return replace(hand(count, rng, 2.0), rotation=rotation)
-
-
-def fly(seed: int) -> Frames:
-    return simulate(Camera(), level, Rich(), 1, LENGTH, seed)
 
 
 def true_states(camera: States) -> tuple[Array, Array, Array, Array]:
@@ -91,7 +87,7 @@ def write_tf(
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory) -> Flight:
     path = tmp_path_factory.mktemp("flight") / "flight"
-    frames = fly(3)
+    frames = simulate(Camera(), level, Rich(), 1, LENGTH, 3)
     truth = true_states(frames.first)
     turned = Rotation.from_euler("z", 50.0, degrees=True).as_matrix()
     odometry = []
@@ -112,14 +108,10 @@ def flight(tmp_path_factory) -> Flight:
     return Flight(path, *truth, odometry)
 
 
-def localizer(config: NodeConfig, transforms: Any) -> CameraFrames:
-    return CameraFrames(config, transforms=transforms)
-
-
 def replayed(flight: Flight, config: NodeConfig) -> tuple[list[Localized], CameraFrames]:
     with open_bag(flight.path) as bag:
         topics = find_topics(bag)
-        used = localizer(config, find_transforms(bag, topics, config))
+        used = CameraFrames(config, transforms=find_transforms(bag, topics, config))
         found = [answer.result for answer in replay(bag, topics, used)]
     assert all(found)
     assert len(found) == LENGTH
