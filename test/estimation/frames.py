@@ -74,3 +74,10 @@ def alike(found, expected, scale, **within):
     """Assert that vectors (n,) or matrices (n,n) are equal in units of deviations (n,)."""
     units = scale if np.ndim(found) == 1 else np.outer(scale, scale)
     np.testing.assert_allclose(found / units, expected / units, **within)
+
+
+def agree(step, covariance, expected, own, **within):
+    """Assert that a Gaussian has this mean (n,) and covariance (n,n), in its deviations."""
+    deviations = np.sqrt(np.diag(own))
+    alike(step, expected, deviations, **within)
+    alike(covariance, own, deviations, **within)

@@ -19,7 +19,7 @@ from rs_localizer.estimation.gaussian import (
 from rs_localizer.estimation.linear_fit import Noise, nothing_shared
 from rs_localizer.estimation.prior import held_terms
 
-from .frames import fitted, observe
+from .frames import alike, fitted, observe
 from .projection import disturbed, in_camera, pixels_of
 
 CENTRE = np.array([0.3, -0.2, 3.0])
@@ -32,10 +32,6 @@ def arched(found):
         found.covariance[:18, :18], found.state[9:12], found.possible, found.offsets,
         found.covariances,
     )  # fmt: skip
-
-
-def hat(v):
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def test_moments_of_a_mixture_are_those_of_cameras_on_the_arc():
@@ -52,17 +48,14 @@ def test_moments_of_a_mixture_are_those_of_cameras_on_the_arc():
     moved = CENTRE - Rotation.from_rotvec(phi).apply(CENTRE + d)
     steps = np.hstack([phi, moved])
     expected = steps.T @ steps / count
-    by = np.block([[np.eye(3), np.zeros((3, 3))], [hat(CENTRE), -np.eye(3)]])
+    by = np.block([[np.eye(3), np.zeros((3, 3))], [np.cross(np.eye(3), CENTRE), -np.eye(3)]])
     offsets, covariances = np.zeros((2, 18)), np.zeros((2, 18, 18))
     offsets[:, :6] = middles @ by.T
     covariances[:, :6, :6] = by @ deviations**2 @ by.T
     both = np.einsum("k,ki,kj->ij", weights, offsets, offsets)
     both += np.tensordot(weights, covariances, 1)
     found = along_arcs(both, CENTRE, weights, offsets, covariances)[:6, :6]
-    scale = np.sqrt(expected.diagonal())
-    np.testing.assert_allclose(
-        found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.03
-    )
+    alike(found, expected, np.sqrt(expected.diagonal()), atol=0.03)
     alone = along_arcs(both, CENTRE, np.ones(1), np.zeros((1, 18)), both[None])
     # One Gaussian of these moments is 15 % off along the line of sight.
     assert abs(alone[5, 5] / expected[5, 5] - 1.0) > 0.1
@@ -105,10 +98,7 @@ def test_mean_and_moments_are_by_their_own_weights(parts, temper):
     away = steps - mean
     expected = np.einsum("k,ki,kj->ij", possible, away, away)
     expected += np.tensordot(possible, given.covariances, 1)
-    scale = np.sqrt(expected.diagonal())
-    np.testing.assert_allclose(
-        found.covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.02
-    )
+    alike(found.covariance, expected, np.sqrt(expected.diagonal()), atol=0.02)
     np.testing.assert_allclose(arched(found), found.covariance[:18, :18], atol=1e-12)
 
 

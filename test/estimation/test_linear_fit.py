@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from rs_localizer.core.shake import CYCLES, IN_COMBINATIONS, TYPICAL_SIZES
+from rs_localizer.core.shake import CYCLES, TYPICAL_SIZES
 from rs_localizer.estimation.linear_fit import (
     BLOCKS,
     FACTORS,
@@ -32,7 +32,7 @@ from rs_localizer.estimation.linear_fit import (
 from rs_localizer.estimation.prior import add_prior, terms_at
 from rs_localizer.estimation.projection import linearized
 
-from .frames import PRIOR, frame
+from .frames import PRIOR, agree, alike, frame
 
 NOISE = 0.4
 SIZES = np.linspace(-2.5, 5.5, 11)  # as the module has them
@@ -93,10 +93,7 @@ def test_sizes_are_integrated_as_over_dense_matrices(bent):
     mean = weights @ np.array(steps)
     spread = np.einsum("k,kij->ij", weights, covariances)
     spread += np.einsum("k,ki,kj->ij", weights, steps - mean, steps - mean)
-    deviations = np.sqrt(np.diag(spread))
-    np.testing.assert_allclose(found.step / deviations, mean / deviations, atol=0.02)
-    scaled = found.covariance / np.outer(deviations, deviations)
-    np.testing.assert_allclose(scaled, spread / np.outer(deviations, deviations), atol=0.02)
+    agree(found.step, found.covariance, mean, spread, atol=0.02)
     expected = logsumexp(logs) - logsumexp(-0.5 * SIZES**2)
     expected += 0.5 * np.log(np.diag(TERMS.informations[0])[6:]).sum()
     assert found.evidence == pytest.approx(expected, abs=0.05)
@@ -109,7 +106,9 @@ def test_odds_are_probabilities():
 
 
 def shaking():
-    """Points of a camera that is linearized without its vibration, and whole waves as columns."""
+    """Points of a camera that is linearized without its vibration, whole waves as columns, and the
+    fit's equations, in which points share no error.
+    """
     observations, truth = frame(5, 0.05, 0.5, count=40)
     lines = linearized(observations.packed, 40, truth, np.zeros((40, 6)))
     dense = lines.by_motion.reshape(80, 18)
@@ -121,12 +120,14 @@ def shaking():
         middle[6 + axis, 1::2, axis] = 2.0 * np.pi * CYCLES
     middle = middle.reshape(18, -1)
     turns = (lines.by_turn[:, :, None, :] * waves[:, None, :, None]).reshape(80, -1)
-    return truth, lines, dense, turns + dense @ middle, middle
+    shared = nothing_shared(40)
+    linear = linear_of(lines, np.ones(40, bool), True, shared.rows)
+    return truth, lines, dense, turns + dense @ middle, middle, shared, linear
 
 
 def test_vibration_is_integrated_as_over_dense_matrices():
     """Whole cosines and sines beside a motion of which a prior knows something, at one noise."""
-    truth, lines, dense, turns, middle = shaking()
+    truth, lines, dense, turns, middle, shared, linear = shaking()
     information, slope = np.zeros((18, 18)), np.zeros(18)
     prior_cost = add_prior(PRIOR, truth, 1.0, information, slope)
     errors = lines.errors.ravel()
@@ -155,8 +156,7 @@ def test_vibration_is_integrated_as_over_dense_matrices():
         mean = -inner @ along
         second = rest * left / freedom / noise**2 * inner + np.outer(mean, mean)
         moments.append(pull @ second @ pull.T)
-    shared, chosen = nothing_shared(40), np.ones(40, bool)
-    linear = linear_of(lines, chosen, True, shared.rows)
+    np.testing.assert_allclose(linear.every[:18, :18], dense.T @ dense)
     known = known_at(PRIOR, truth)
     found = fit(linear, shared, known, Noise(noise, 1.0, 18.0), VIBRATION, True)
     assert found.gain == pytest.approx(logsumexp(logs), abs=0.05)
@@ -170,43 +170,8 @@ def test_vibration_is_integrated_as_over_dense_matrices():
     moved = whole @ found.step - first
     shown += np.outer(moved, moved)
     # Pose and velocities; what truncated combinations lose of accelerations is not asked for.
-    deviations = np.sqrt(np.diag(expected))[:12]
-    np.testing.assert_allclose(
-        shown[:12, :12] / np.outer(deviations, deviations),
-        expected[:12, :12] / np.outer(deviations, deviations), atol=0.05,
-    )  # fmt: skip
-
-
-def test_blocks_by_name_have_their_mean_and_covariance():
-    """Of one spectrum and one size all unknowns are one dense solution, scaled by its noise."""
-    truth, lines, dense, _, _ = shaking()
-    rng = np.random.default_rng(2)
-    turn, shared, chosen = 1e-3 * rng.normal(size=TURNS), nothing_shared(40), np.ones(40, bool)
-    linear = linear_of(lines, chosen, True, shared.rows)
-    linear = moved(linear, np.append(np.zeros(18), -turn))  # as errors of no vibration
-    odds = np.full(VIBRATION.odds.shape, -np.inf)
-    odds[3] = 0.0
-    one = VIBRATION._replace(odds=odds)
-    found = fit(linear, shared, known_at(PRIOR, truth), Noise(0.5, 1.0, 18.0), one, True)
-    information, slope = linear.every[:-1, :-1] / 0.25, linear.every[:-1, -1] / 0.25
-    np.testing.assert_allclose(linear.every[:18, :18], dense.T @ dense)
-    of_prior, pulled = np.zeros((18, 18)), np.zeros(18)
-    add_prior(PRIOR, truth, 1.0, of_prior, pulled)
-    information[:18, :18] += of_prior
-    slope[:18] += pulled
-    small = np.repeat(TYPICAL_SIZES * FACTORS[3], 2) ** 2
-    prior = np.linalg.inv(IN_COMBINATIONS * small @ IN_COMBINATIONS.T)
-    information[18:, 18:] += np.kron(prior, np.eye(3))
-    covariance = (found.noise / 0.5) ** 2 * np.linalg.inv(information)
-    mean = -np.linalg.solve(information, slope)
-    for name, place in BLOCKS.items():
-        of_mean, own = marginal(found, name)
-        deviations = np.sqrt(np.diag(covariance))[place]
-        np.testing.assert_allclose(of_mean / deviations, mean[place] / deviations, atol=1e-4)
-        np.testing.assert_allclose(
-            own / np.outer(deviations, deviations),
-            covariance[place, place] / np.outer(deviations, deviations), atol=1e-4,
-        )  # fmt: skip
+    poses = expected[:12, :12]
+    alike(shown[:12, :12], poses, np.sqrt(np.diag(poses)), atol=0.05)
 
 
 @pytest.mark.parametrize("name", ["turn", SHARED])
@@ -223,22 +188,15 @@ def test_a_block_that_is_dropped_by_name_leaves_the_fit_without_it(name):
         dropped = fit(without(both, name), nothing, known, noise, VIBRATION, True)
         never = linear_of(lines, chosen, True, nothing.rows)
         expected = fit(never, nothing, known, noise, VIBRATION, True)
-    deviations = np.sqrt(np.diag(expected.covariance))
-    np.testing.assert_allclose(dropped.step / deviations, expected.step / deviations, atol=1e-12)
-    np.testing.assert_allclose(
-        dropped.covariance / np.outer(deviations, deviations),
-        expected.covariance / np.outer(deviations, deviations), atol=1e-12,
-    )  # fmt: skip
+    agree(dropped.step, dropped.covariance, expected.step, expected.covariance, atol=1e-12)
     assert dropped.evidence == pytest.approx(expected.evidence, abs=1e-9)
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.1, 0.3])
 def test_another_prior_of_the_motion_makes_the_fit_that_it_would_have_made(speed):
-    truth, lines, _, _, _ = shaking()
-    shared, chosen = nothing_shared(40), np.ones(40, bool)
+    truth, *_, shared, linear = shaking()
     still = truth.copy()
     still[12:] = 0.0
-    linear = linear_of(lines, chosen, True, shared.rows)
     linear = moved(linear, np.append(np.zeros(6), np.append(-truth[12:], np.zeros(TURNS))))
     odds = np.full(VIBRATION.odds.shape, -np.inf)
     odds[2] = 0.0
@@ -250,23 +208,15 @@ def test_another_prior_of_the_motion_makes_the_fit_that_it_would_have_made(speed
     expected = fit(linear, shared, after, Noise(noise, 1.0, 18.0), one, True)
     # Its evidence is of the errors' freedom before the turn, too, takes parameters.
     shown = under(first._replace(freedom=80.0 - 18.0), before, after)
-    deviations = np.sqrt(np.diag(expected.covariance))
-    np.testing.assert_allclose(
-        shown.step / deviations, expected.step / deviations, rtol=1e-3, atol=1e-3
-    )
-    ratio = (noise / expected.noise) ** 2
-    units = np.outer(deviations, deviations)
-    np.testing.assert_allclose(
-        shown.covariance / units, ratio * expected.covariance / units, atol=1e-3
-    )
+    own = (noise / expected.noise) ** 2 * expected.covariance
+    agree(shown.step, shown.covariance, expected.step, own, rtol=1e-3, atol=1e-3)
     assert shown.evidence == pytest.approx(expected.evidence, abs=1e-3)
 
 
 def test_a_gyroscope_enters_as_mean_and_covariance_of_the_turn_and_what_couples_it():
     """One Gaussian of all 72 unknowns, beside a motion's own prior: one dense solution."""
-    truth, lines, _, _, _ = shaking()
-    rng, shared, chosen = np.random.default_rng(7), nothing_shared(40), np.ones(40, bool)
-    linear, known = linear_of(lines, chosen, True, shared.rows), known_at(PRIOR, truth)
+    truth, *_, shared, linear = shaking()
+    rng, known = np.random.default_rng(7), known_at(PRIOR, truth)
     mean, factor = np.append(np.zeros(18), 1e-3 * rng.normal(size=TURNS)), np.zeros((72, 72))
     factor[6:9], factor[18:] = rng.normal(size=(3, 72)), rng.normal(size=(54, 72))
     told = 1e5 * factor @ factor.T  # of angular velocities and the turn
@@ -283,22 +233,18 @@ def test_a_gyroscope_enters_as_mean_and_covariance_of_the_turn_and_what_couples_
     slope -= told @ mean
     information[:18, :18] += known.form[:18, :18]
     slope[:18] += known.form[:18, 18]
-    expected = np.linalg.inv(information)
-    deviations = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(
-        (mean + found.step) / deviations, -expected @ slope / deviations, atol=1e-4
-    )
-    np.testing.assert_allclose(
-        found.covariance / (found.noise / 0.5) ** 2 / np.outer(deviations, deviations),
-        expected / np.outer(deviations, deviations), atol=1e-4,
-    )  # fmt: skip
+    expected = (found.noise / 0.5) ** 2 * np.linalg.inv(information)
+    away = -np.linalg.solve(information, slope) - mean
+    for name, place in BLOCKS.items():
+        agree(*marginal(found, name), away[place], expected[place, place], atol=1e-4)
+    agree(found.step, found.covariance, away, expected, atol=1e-4)
 
 
 @pytest.mark.parametrize("noise", [1e-9, 1e-3, 1e6])
 @pytest.mark.parametrize("size", [0.0, 1e-200, 1e-9, 1e9, 1e150])
 def test_no_size_of_errors_is_an_exception(noise, size):
-    truth, lines, _, _, _ = shaking()
-    shared, known = nothing_shared(40), known_at(PRIOR, truth)
+    truth, lines, *_, shared, _ = shaking()
+    known = known_at(PRIOR, truth)
     far = lines._replace(errors=size * lines.errors)
     linear = linear_of(far, np.ones(40, bool), True, shared.rows)
     found = fit(linear, shared, known, Noise(noise, 1.0, 18.0), VIBRATION, True)
@@ -320,24 +266,9 @@ def test_products_farther_along_the_tangent_leave_the_same_optimum():
     assert farther.evidence == pytest.approx(at_once.evidence, abs=1e-8)
 
 
-def test_without_an_in_frame_turn_it_explains_nothing():
-    truth, chosen, lines, shared, _ = everything(False)
-    linear = linear_of(lines, chosen, False, shared.rows)
-    found = fit(linear, shared, known_at(TERMS, truth), Noise(NOISE, 1.0, 12.0), NO_TURN, True)
-    assert found.gain == 0.0
-    assert found.weights.size == 0
-
-
 @pytest.mark.parametrize("bent", [False, True])
 def test_combinations_of_columns_are_orthonormal_and_say_the_same(bent):
-    observations, truth = frame(3, 0.05, 0.4, count=30)
-    chosen = np.ones(30, bool)
-    chosen[[4, 17]] = False
-    lines = linearized(observations.packed, 30, truth, np.zeros((30, 6)))
-    bend = bend_of(observations.points, chosen, 4.0 / 590.0) if bent else np.zeros((30, 0))
-    shared = smooth_error(lines, chosen, bend, 0.2)
-    columns = smooth_columns(lines.by_motion[chosen], lines.image[chosen], bend[chosen])
-    columns = columns.reshape(56, -1)
+    *_, shared, columns = everything(bent)
     np.testing.assert_allclose(shared.rows.T @ shared.rows, np.eye(len(shared.squares)), atol=1e-9)
     most = shared.squares.max()
     np.testing.assert_allclose(

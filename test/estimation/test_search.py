@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The loop with mock solvers: what it draws, when it stops, what it keeps."""
 
-import functools
 from dataclasses import replace
 
 import numpy as np
@@ -30,13 +29,13 @@ ROWS = 1.0  # range of the row times
 class Solver:
     """Gives the true motion for samples of inliers alone, and another one for all others."""
 
-    def __init__(self, model, outliers, always_wrong=False):
-        self.model, self.outliers, self.always_wrong = model, outliers, always_wrong
+    def __init__(self, model, outliers):
+        self.model, self.outliers = model, outliers
         self.samples = []
 
     def __call__(self, points, rays, tau, samples, rotations, iterations, models):
         self.samples.append(samples.copy())
-        good = ~self.outliers[samples].any(axis=1) & (not self.always_wrong)
+        good = ~self.outliers[samples].any(axis=1)
         wrong = self.model.copy()
         wrong[9] += 1.0
         models[0] = np.where(good, self.model[:, None], wrong[:, None])
@@ -52,26 +51,22 @@ def problem(outlier_share):
     return changed(observations, points), model, outliers
 
 
-def run(observations, solver, pools, max_samples=2000, start=NOTHING):
+def run(observations, solver, *pools):
+    """The search by pools of equal shares."""
     mock = replace(find_solver("r6p_vcwt"), solve=solver)
     hypotheses = Hypotheses(mock, 50, 8.0, 2.0, 1.0, 5)
-    draws = Draws(np.eye(3), pools, 0.99, max_samples, generator(1))
-    return search(observations, hypotheses, FREE, draws, start)
-
-
-def pools_from(*points, ranked=False):
-    """Pools of equal shares."""
-    return [Pool.of(each, ROWS, 1.0, 6 if ranked else 0) for each in points]
+    shares = [Pool.of(points, ROWS, 1.0, 0) for points in pools]
+    draws = Draws(np.eye(3), shares, 0.99, 2000, generator(1))
+    return search(observations, hypotheses, FREE, draws, NOTHING)
 
 
 EVERYTHING = np.arange(100)
-ALL = pools_from(EVERYTHING)
 
 
 def test_it_finds_the_inliers_and_stops_when_it_is_sure():
     observations, model, outliers = problem(0.5)
     solver = Solver(model, outliers)
-    found = run(observations, solver, ALL)
+    found = run(observations, solver, EVERYTHING)
     inliers = observations.squared_errors(found.state) < 4.0
     assert (inliers == ~outliers).mean() > 0.97
     # log(0.01) / log(1 - 0.5^6) = 293 samples, in blocks of 50.
@@ -82,7 +77,7 @@ def test_it_finds_the_inliers_and_stops_when_it_is_sure():
 def test_good_pools_stop_the_search_early_and_all_are_drawn_from():
     observations, model, outliers = problem(0.7)
     solver = Solver(model, outliers)
-    found = run(observations, solver, pools_from(np.flatnonzero(~outliers), EVERYTHING))
+    found = run(observations, solver, np.flatnonzero(~outliers), EVERYTHING)
     assert found.samples == 50
     (samples,) = solver.samples
     assert not outliers[samples[:25]].any()
@@ -91,21 +86,21 @@ def test_good_pools_stop_the_search_early_and_all_are_drawn_from():
 
 @pytest.fixture(scope="session")
 def samples_of(as_python):
-    return functools.partial(_samples_of, as_python(draw))
+    drawn = as_python(draw)
 
+    def samples_of(pool, count, size, tau):
+        samples, all_of_it = np.full((count, size), -1), np.full(count, len(pool))
+        drawn(pool, all_of_it, tau, float(np.ptp(tau)), generator(0), samples)
+        return samples
 
-def _samples_of(drawn, pool, count, size, tau=None, seed=0, prefixes=None):
-    tau = np.linspace(-0.5, 0.5, 1000) if tau is None else tau
-    samples = np.full((count, size), -1, dtype=np.int64)
-    if prefixes is None:
-        prefixes = np.full(count, len(pool), dtype=np.int64)
-    drawn(np.asarray(pool, np.int64), prefixes, tau, float(np.ptp(tau)), generator(seed), samples)
-    return samples
+    return samples_of
 
 
 def test_all_points_are_drawn_equally_often(samples_of):
     pool = np.random.default_rng(0).permutation(1000)[:50]
-    counts = np.bincount(samples_of(pool, 20000, 6).ravel(), minlength=1000)[pool]
+    counts = np.bincount(
+        samples_of(pool, 20000, 6, np.linspace(-0.5, 0.5, 1000)).ravel(), minlength=1000
+    )[pool]
     expected = 20000 * 6 / 50
     # Five standard deviations of a count.
     assert np.abs(counts - expected).max() < 5 * np.sqrt(expected)
