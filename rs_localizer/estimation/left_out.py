@@ -113,7 +113,8 @@ def left_out(
     failure = None if known else _by_chance(observed, posterior, wide)
     if failure is not None:
         return LeftOut(failure, _rough(observed, posterior) if wide else "")
-    most = _BENT_OFF_CENTRE if _is_off_centre(observed) else _BENT
+    # A principal point alone may point to another image.
+    most = _BENT_OFF_CENTRE if off_centre(observed.exposure.cameras[0]) else _BENT
     bent = posterior.model_error > most * promised(posterior)
     bent |= posterior.noise > EXPECTED_NOISE * threshold
     second = _own_motion(search, observed, rest, threshold) if left > _SAMPLE else None
@@ -142,11 +143,6 @@ def left_out(
         f"{text}: which of both is the camera's? A part of the map was moved, or the calibration "
         "is grossly wrong",
     ))  # fmt: skip
-
-
-def _is_off_centre(observed: Observed) -> bool:
-    """Return whether K's principal point alone points to another image."""
-    return off_centre(observed.exposure.cameras[0])
 
 
 def _cameras_apart(observed: Observed, inliers: BoolArray, second: _Group, threshold: float) -> str:
@@ -226,7 +222,7 @@ def _of_another_lens(
 ) -> Failure | None:  # fmt: skip
     """Return the failure of a frame that another matrix explains better than two motions."""
     area, count = _area(observed), observed.observations.count
-    resized = _is_off_centre(observed)
+    resized = off_centre(observed.exposure.cameras[0])
     kinds = (False, True) if resized else (False,)
     found = [_another_lens(search, observed, threshold, of_size) for of_size in kinds]
     explained, group, numbers = max(

@@ -417,8 +417,9 @@ def taken_by(squares: Array1, size: float, noise: float) -> Array:
 @kernel
 def cost_of(linear: Linear, taken: Array1, variance: float, known: KnownMotion) -> float:
     """Return the errors beside what points share, in noise variances, and the prior's cost."""
-    left: float = linear.every[-1, -1] - np.sum(taken * linear.beside[:, -1] ** 2)
-    return left / variance + known.form[-1, -1]
+    left = linear.every[-1, -1] - np.sum(taken * linear.beside[:, -1] ** 2)
+    cost: float = left / variance + known.form[-1, -1]
+    return cost
 
 
 @kernel
