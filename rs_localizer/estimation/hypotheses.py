@@ -89,8 +89,9 @@ _KEPT = 0.9
 _NO_PART = 1e-4
 # Log odds of no vibration: one in ten of the cameras that do not show vibration has some.
 _HIDDEN_ODDS = math.log(10.0)
-# Logarithm of the evidence of an ordinary vibration against none from which it is fitted.
-_ASKS = -0.5
+# Logarithm of the evidence of an ordinary vibration against none from which it is fitted; before a
+# plane, of whose leans that fit knows nothing.
+_ASKS, _ASKS_OF_PLANE = -0.5, 5.0
 # One frame tells no more of a vibration than this logarithm of odds: none is as Gaussian as that.
 _MOST_TOLD = 5.0
 # A last step this short, in squared standard deviations: the next one is its square.
@@ -235,7 +236,7 @@ def _of_points(
             groups = [steady, turning] if planar else [turning]
     elif assumed.rolling and not (declares and planar):
         # Apparent vibration before a bent board is more of its bend.
-        groups = _with_turn(given, hypotheses, steady)
+        groups = _with_turn(given, hypotheses, steady, _ASKS_OF_PLANE if planar else _ASKS)
     return _mixed(given, groups)
 
 
@@ -328,8 +329,10 @@ def _of_outliers(given: _Given, inliers: BoolArray) -> float:
     return 2.0 * outside * math.log(given.assumed.focal_length)
 
 
-def _with_turn(given: _Given, hypotheses: list[MotionHypothesis], steady: _Camera) -> list[_Camera]:
-    """Return hypotheses without in-frame rotation, and with it if it is possible."""
+def _with_turn(
+    given: _Given, hypotheses: list[MotionHypothesis], steady: _Camera, asks: float
+) -> list[_Camera]:
+    """Return hypotheses without in-frame rotation, and with it if its evidence is what it asks."""
     odds, before = VIBRATION.odds, given.assumed.of_vibration
     if before.size:
         odds = odds + before
@@ -337,7 +340,7 @@ def _with_turn(given: _Given, hypotheses: list[MotionHypothesis], steady: _Camer
     prior = VIBRATION._replace(odds=odds - expected)
     gain, undetected, vibrations = _hidden(given, steady.posterior, prior)
     gain, posterior = gain + expected, steady.posterior._replace(vibrations=vibrations)
-    vibrating = _vibrating(given, hypotheses, posterior, prior) if gain > _ASKS else None
+    vibrating = _vibrating(given, hypotheses, posterior, prior) if gain > asks else None
     if vibrating is None:
         weight = 1.0 / (1.0 + math.exp(min(_HIDDEN_ODDS - TEMPER * gain, 700.0)))
         return [steady._replace(posterior=posterior._replace(undetected=weight * undetected))]
