@@ -368,21 +368,19 @@ class Localizer:
 
     def _settle(self, observed: Observed, best: Candidate, terms: PriorTerms) -> Posterior:
         # Unless more is known of this very frame than the prior of the configuration.
-        assumed = observed.assumed
         may_rest = self._assume(self._exposure.span)[1].may_rest and len(terms.informations) == 1
-        if may_rest != assumed.may_rest:
-            assumed = replace(assumed, may_rest=may_rest)
-        gate = self._gate(observed, best.state)
+        gate, in_frame = self._gate(observed, best.state), None
         if observed.rotation is not None:
-            predicted = terms is not observed.terms
-            assumed = replace(assumed, in_frame=coupled_turn(observed.rotation, predicted))
+            in_frame = coupled_turn(observed.rotation, terms is not observed.terms)
+        one_lens = observed.exposure.alone
+        assumed = replace(observed.assumed, may_rest=may_rest, one_lens=one_lens, in_frame=in_frame)
         observations = observed.observations
         if not self._full:
             seen = observations.packed, observations.count
             return Posterior(*best_motion(*seen, best.state, terms, gate))._replace(gate=gate)
-        one_lens, most = observed.exposure.alone, _WIDEST * gate
+        most = _WIDEST * gate
         while True:
-            posterior = frame_posterior(observations, best.state, terms, gate, assumed, one_lens)
+            posterior = frame_posterior(observations, best.state, terms, gate, assumed)
             posterior = posterior._replace(gate=gate)
             # A map whose points are off by more than anybody said has more noise than a gate lets
             # through: as long as the noise fills it, nobody knows how much.

@@ -151,7 +151,8 @@ def mixture(parts: Gaussians, preferences: Array, temper: float) -> Mixture:
     about[:, :6] = by_step @ about[:, :6]
     about[:, :, :6] = about[:, :, :6] @ by_step.transpose(0, 2, 1)
     away = np.hstack([offsets, parts.turns - turn])
-    covariance = np.tensordot(possible, about, 1) + (possible * away.T) @ away
+    covariance = (possible @ about.reshape(len(possible), -1)).reshape(about.shape[1:])
+    covariance += (possible * away.T) @ away
     about = about[:, :PARAMETERS, :PARAMETERS]
     return Mixture(state, turn, covariance, evidence, probable, possible, offsets, about)
 

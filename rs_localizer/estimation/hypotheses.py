@@ -183,9 +183,8 @@ class _Camera(NamedTuple):
 
 
 def frame_posterior(
-    observations: Observations, start: Array, terms: PriorTerms, threshold: float, assumed: Assumed,
-    one_lens: bool = True,
-) -> Posterior:  # fmt: skip
+    observations: Observations, start: Array, terms: PriorTerms, threshold: float, assumed: Assumed
+) -> Posterior:
     """Return the posterior of the motion given the points, near a first motion.
 
     Args:
@@ -194,34 +193,25 @@ def frame_posterior(
         terms: what is known of the motion beside the points.
         threshold: px, of inliers.
         assumed: of the camera.
-        one_lens: one camera sees them all; of two lenses a smooth error is not one polynomial.
     """
     if observations.count > MOST_POINTS:
         some = np.linspace(0, observations.count - 1, MOST_POINTS).astype(np.int64)
-        part = _of_points(observations.only(some), start, terms, threshold, assumed, one_lens)
+        part = frame_posterior(observations.only(some), start, terms, threshold, assumed)
         lines = linearized(
             observations.packed, observations.count, part.state,
             shake_at(observations.tau, part.shake),
         )  # fmt: skip
         errors = np.sum(lines.errors**2, axis=1)
         # The farthest inlier of the part is one of all points: no rounding leaves it out.
-        inliers = errors <= errors[some][part.inliers].max(initial=0.0)
-        bend = part.bend
+        inliers, bend = errors <= errors[some][part.inliers].max(initial=0.0), part.bend
         if bend.shape[1]:
             depth = max(observations.median_depth(part.state, inliers), NEAREST)
             bend = bend_of(observations.points, inliers, depth / assumed.focal_length)
         return part._replace(squared_errors=errors, inliers=inliers, bend=bend)
-    return _of_points(observations, start, terms, threshold, assumed, one_lens)
-
-
-def _of_points(
-    observations: Observations, start: Array, terms: PriorTerms, threshold: float, assumed: Assumed,
-    one_lens: bool,
-) -> Posterior:  # fmt: skip
     best = Posterior(*best_motion(observations.packed, observations.count, start, terms, threshold))
     if not best.determined or np.count_nonzero(best.inliers) < _FEWEST:
         return best
-    given = _given(observations, best, terms, threshold, assumed, one_lens)
+    given = _given(observations, best, terms, threshold, assumed)
     declares, best = assumed.map_deviation > 0.0, given.best
     planar, _, _ = plane_of(observations.points, best.inliers)
     is_clear = not (declares or planar) and _clearly_moving(given)
@@ -242,7 +232,7 @@ def _of_points(
 
 def _given(
     observations: Observations, best: Posterior, terms: PriorTerms, threshold: float,
-    assumed: Assumed, one_lens: bool,
+    assumed: Assumed,
 ) -> _Given:  # fmt: skip
     """Compute everything that does not depend on the hypothesis."""
     data, points, count = observations.packed, observations.points, observations.count
@@ -255,7 +245,7 @@ def _given(
     if assumed.rolling:
         if declared:
             bend = bend_of(points, best.inliers, depth / assumed.focal_length)
-        if one_lens:
+        if assumed.one_lens:
             shared = smooth_error(lines, best.inliers, bend, size)
     left = float(best.squared_errors[best.inliers].sum()) / max(best.freedom, 1.0)
     noise = Noise(

@@ -360,7 +360,8 @@ def without(linear: Linear, name: str) -> Linear:
     """Return the system without a block of unknowns, or without shared errors."""
     if name == SHARED:
         return linear._replace(beside=np.zeros_like(linear.beside[:1]))
-    return changed(linear, np.delete(np.eye(len(linear.every)), np.r_[BLOCKS[name]], axis=1))
+    kept = np.delete(np.arange(len(linear.every)), BLOCKS[name])
+    return Linear(linear.every[kept][:, kept].copy(), linear.beside[:, kept].copy())
 
 
 def moved(linear: Linear, step: Array) -> Linear:

@@ -431,6 +431,7 @@ class Assumed:
     focal_length: float  # px
     may_rest: bool  # nothing speaks for a motion but the points
     rolling: bool  # velocities are estimated
+    one_lens: bool = True  # of two lenses a smooth error is not one polynomial
     of_rest: float = 0.0  # logarithm of the odds for rest, beside those of any camera
     of_vibration: Array = field(default_factory=np.zeros(0).copy)  # see Prior
     turn: TurnSeen | None = None  # by a rotation prior

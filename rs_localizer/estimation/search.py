@@ -341,8 +341,6 @@ _BLOCK = 64
 _FEW_SAMPLES = 384
 # A start leads nowhere if its own motion fits less than this part of the points near it.
 _AGREEING = 0.5
-# Samples of left-out points: enough to find three inliers if two fifths are inliers.
-_START_SAMPLES = 96
 
 
 class MotionSearch:
@@ -378,23 +376,23 @@ class MotionSearch:
         return self._motion(observed, start, most)
 
     def rough(self, observed: Observed) -> Candidate:
-        """Find a pose that fits all rows of enough points roughly, or nothing."""
-        return self._global_shutter(observed, _START_SAMPLES, _START_SAMPLES)
+        """Find a pose that fits all rows of enough points roughly, or nothing.
+
+        One block finds three inliers if two fifths of the points are inliers.
+        """
+        return self._global_shutter(observed, _GLOBAL_SHUTTER_BLOCK)
 
     def from_rough(self, observed: Observed, start: Candidate) -> Candidate:
         """Find the motion of most points near a rough pose, by few samples."""
         return self._motion(observed, start, _FEW_SAMPLES)
 
-    def _global_shutter(
-        self, observed: Observed, most: int, block: int = _GLOBAL_SHUTTER_BLOCK
-    ) -> Candidate:
+    def _global_shutter(self, observed: Observed, most: int) -> Candidate:
         """Find a pose that fits all rows roughly, with a wide threshold."""
         observations = observed.observations
         every, size = np.ones(observations.count, np.bool_), self._start.sample_size
         pools = pools_of(observations, size, every, observed.ranking, False)
         draws = Draws(np.eye(3), pools, self._config.confidence, most, observed.random)
-        starts = self._starts._replace(block=block)
-        return search(observations, starts, held_terms(), draws, NOTHING)
+        return search(observations, self._starts, held_terms(), draws, NOTHING)
 
     def _motion(self, observed: Observed, start: Candidate, most: int) -> Candidate:
         """Find the motion that most points agree on, from the solver's hypotheses."""
