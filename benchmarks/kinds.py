@@ -3,6 +3,7 @@
 """What is noticed of faults that the model of a frame does not have, and what is not.
 
 python -m benchmarks.kinds --seeds 1 2
+python -m benchmarks.kinds hour
 
 Each row is one kind of fault: two recordings of a hand-held camera before landmarks that stay where
 they are, through the code that node and ``replay`` share. Nothing of the package makes the frames.
@@ -10,6 +11,9 @@ Columns: how many of 60 frames are published, median errors of the pose at the s
 angular velocity, how many of the published poses and of the known twists lie in their 95 % regions,
 how many are beyond five standard deviations in either, and what is said (notices, and reasons of
 refusals).
+
+``hour``: right cameras and maps, in recordings that are an hour together, and in how many of them
+something is said.
 """
 
 from __future__ import annotations
@@ -29,7 +33,7 @@ from scipy.stats import chi2, norm
 from benchmarks.experiments.results import Table
 from benchmarks.independent.cameras import Camera
 from benchmarks.independent.frames import PERIOD_NS
-from benchmarks.independent.motions import Motions, States, hand
+from benchmarks.independent.motions import Motions, States, hand, steady
 from benchmarks.independent.rotations import Array, exponential, logarithm
 from benchmarks.independent.scenes import visible
 from rs_localizer.config import CalibrationErrors, NodeConfig
@@ -81,6 +85,8 @@ class Kind:
     tracked: bool = True
     camera: Camera = _PLAIN
     settings: NodeConfig = _ORDINARY
+    motion: Callable[[int, np.random.Generator], Motions] = hand
+    noise: float = _NOISE
 
 
 # Landmarks in the axes of the camera at rest, m.
@@ -106,10 +112,26 @@ def _wall(rng: np.random.Generator) -> Array:
     return _tilted(np.column_stack([flat, np.zeros(len(flat))]), 2.0, rng)
 
 
-def _board(rng: np.random.Generator) -> Array:
-    """A chessboard of 9 x 6 corners, half a metre wide, 1 m away."""
+def _flat_board() -> Array:
+    """A chessboard of 9 x 6 corners, half a metre wide."""
     x, y = np.meshgrid(np.linspace(-0.25, 0.25, 9), np.linspace(-0.156, 0.156, 6))
-    return _tilted(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]), 1.0, rng)
+    return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+
+
+def _board(rng: np.random.Generator) -> Array:
+    """The board, 1 m away."""
+    return _tilted(_flat_board(), 1.0, rng)
+
+
+def _facing(rng: np.random.Generator) -> Array:
+    """The board, nearly parallel to the image."""
+    return _tilted(_flat_board(), 1.0, rng, (0.0, 5.0))
+
+
+def _hall(rng: np.random.Generator) -> Array:
+    """Points around a way of ten metres."""
+    points: Array = rng.uniform(-9.0, 9.0, (200, 3)) * [1.0, 0.3, 1.0]
+    return points
 
 
 def _room(rng: np.random.Generator) -> Array:
@@ -119,10 +141,13 @@ def _room(rng: np.random.Generator) -> Array:
     return points
 
 
-def _tilted(flat: Array, distance: float, rng: np.random.Generator) -> Array:
+def _tilted(
+    flat: Array, distance: float, rng: np.random.Generator,
+    degrees: tuple[float, float] = (10.0, 35.0),
+) -> Array:  # fmt: skip
     around = rng.uniform(0.0, 2.0 * np.pi)
     axis = np.array([np.cos(around), np.sin(around), 0.0])
-    turned: Array = flat @ exponential(np.radians(rng.uniform(10.0, 35.0)) * axis).T
+    turned: Array = flat @ exponential(np.radians(rng.uniform(*degrees)) * axis).T
     turned[:, 2] += distance
     return turned
 
@@ -188,6 +213,9 @@ def stretched(share: float, seen: Seen, rng: np.random.Generator) -> Seen:
     return seen._replace(points=seen.points + share * (away @ along)[:, None] * along)
 
 
+_CALM = partial(hand, slower=3.0)
+
+
 def kinds() -> list[Kind]:
     """The rows, a control of each scene before its faults."""
     well = NodeConfig(calibration=_WELL)
@@ -195,6 +223,7 @@ def kinds() -> list[Kind]:
         Kind("right: corner", _corner, right),
         Kind("right: wall", _wall, right),
         Kind("right: board", _board, right),
+        Kind("right: facing board", _facing, right, motion=_CALM),
         Kind("right: room", _room, right),
         Kind("right: corner, good lens", _corner, right, camera=_LENS, settings=well),
         Kind("squeezed by 0.7 %, corner", _corner, partial(squeezed, 1.0, 0.993)),
@@ -207,6 +236,8 @@ def kinds() -> list[Kind]:
         Kind("K of half the size, single", _wall, partial(other_resolution, 0.5), False),
         Kind("f of 1.9 times, board", _board, partial(other_lens, 1.9)),
         Kind("f of 0.6 times, board, single", _board, partial(other_lens, 0.6), False),
+        *(Kind(f"f of {share:g} times, facing board", _facing, partial(other_lens, share),
+               motion=_CALM) for share in (1.9, 0.6, 1.1)),
         Kind("rectified, corner", _corner, partial(rectified, 1.0), camera=_LENS, settings=well),
         Kind("rectified, usual deviations", _corner, partial(rectified, 1.0), camera=_LENS),
         Kind("mild lens, rectified, corner", _corner, partial(rectified, 1.0), camera=_MILD,
@@ -221,6 +252,37 @@ def kinds() -> list[Kind]:
         Kind("so, map_deviation 5 mm, wall", _wall, partial(stretched, 0.01),
              settings=NodeConfig(map_deviation=0.005)),
     ]  # fmt: skip
+
+
+_SECONDS, _RUNS = 20, 30
+"""Of a recording, and recordings of each of six kinds: an hour."""
+_SEEN = "published"
+
+
+def hour() -> Table:
+    """What is said of right cameras and maps within an hour."""
+    drive = partial(steady, rate=0.3, speed=0.5)
+    every = [
+        Kind("hand, corner", _corner, right),
+        Kind("hand, wall, 0.3 px", _wall, right, noise=0.3),
+        Kind("hand, board", _board, right),
+        Kind("calm hand, facing board, 0.3 px", _facing, right, motion=_CALM, noise=0.3),
+        Kind("hand, room", _room, right),
+        Kind("drive, hall, 0.3 px", _hall, right, motion=drive, noise=0.3),
+    ]
+    said: dict[str, Counter[str]] = {kind.name: Counter() for kind in every}
+    for run in range(_RUNS):
+        for kind in every:
+            tally = judged(kind, run, 1, round(1e9 * _SECONDS / PERIOD_NS))
+            names = [name for name in tally.said if name not in _NO_WORD]
+            said[kind.name].update([*names, _SEEN] if tally.published else names)
+        sys.stderr.write(f"{run + 1} of {_RUNS}: { ({k: dict(c) for k, c in said.items()}) }\n")
+    rows = []
+    for name, heard in said.items():
+        seen = heard.pop(_SEEN, 0)
+        words = ", ".join(f"{word} {count}" for word, count in heard.most_common())
+        rows.append((name, f"{seen}", words or "nothing"))
+    return Table(("kind", "recordings", "said, in so many of them"), rows)
 
 
 class _Tally:
@@ -280,16 +342,16 @@ def _squared(off: Array, covariance: Array) -> float:
     return float(off @ np.linalg.solve(covariance, off))
 
 
-def judged(kind: Kind, seed: int) -> _Tally:
-    """The frames of a kind, localized."""
+def judged(kind: Kind, seed: int, count: int = _RECORDINGS, length: int = _LENGTH) -> _Tally:
+    """The frames of a kind, localized: so many recordings of so many frames."""
     rng = np.random.default_rng([seed, *kind.name.encode()])
-    motions, camera = hand(_RECORDINGS, rng), kind.camera
+    motions, camera = kind.motion(count, rng), kind.camera
     tally = _Tally()
-    which = np.repeat(np.arange(_RECORDINGS), _LENGTH)
-    times = np.tile(1e-9 * PERIOD_NS * (np.arange(_LENGTH) - _LENGTH // 2), _RECORDINGS)
+    which = np.repeat(np.arange(count), length)
+    times = np.tile(1e-9 * PERIOD_NS * (np.arange(length) - length // 2), count)
     scene = kind.scene(rng)
     # Every recording has its own map: the scene stands before its first pose.
-    frames = [_frames(kind, motions, k, scene, times[which == k]) for k in range(_RECORDINGS)]
+    frames = [_frames(kind, motions, k, scene, times[which == k]) for k in range(count)]
     for k, (exact, bearings, points) in enumerate(frames):
         here = times[which == k]
         true = motions.states(np.full(len(here), k), here)
@@ -329,7 +391,7 @@ def _localize(
     shown = visible(kind.camera, told.pixels)
     for frame, pixels in enumerate(told.pixels):
         points = told.points[shown[frame]]
-        noisy = pixels[shown[frame]] + rng.normal(0.0, _NOISE, (len(points), 2))
+        noisy = pixels[shown[frame]] + rng.normal(0.0, kind.noise, (len(points), 2))
         table = np.zeros(len(points), [*((name, float) for name in "xyzuv"), ("id", np.uint32)])
         for name, column in zip("xyzuv", np.c_[points, noisy].T, strict=True):
             table[name] = column
@@ -347,10 +409,14 @@ def _localize(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.kinds", description=__doc__)
+    parser.add_argument("what", nargs="?", choices=["hour"], help="of right cameras and maps")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--only", nargs="+", default=[], help="words of rows")
     parser.add_argument("--say", action="store_true", help="also what was said last, of each name")
     options = parser.parse_args(arguments)
+    if options.what:
+        print(hour().text())
+        return 0
     rows = []
     for kind in kinds():
         if not all(word in kind.name for word in options.only):

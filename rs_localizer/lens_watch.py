@@ -4,7 +4,7 @@
 
 What one frame leaves may be chance, what all of them leave is not. A lens that belongs to another
 image before one wall is seen in some frames only: where the camera looks at it aslant. Before a
-board none shows it, because motion takes up what it leaves; three frames together do
+board none shows it, because motion takes up what it leaves; frames together do
 (:mod:`.frames_together`).
 """
 
@@ -23,7 +23,7 @@ from rs_localizer.core.rig import Exposure
 from rs_localizer.core.scanning import VERTICAL
 from rs_localizer.core.state import ANGULAR
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation.frames_together import FRAMES, Fitted, Matrix, another_matrix
+from rs_localizer.estimation.frames_together import FRAMES, Fitted, FramesTogether, Matrix
 
 # Frames of which the median counts.
 _FRAMES = 15
@@ -35,10 +35,9 @@ _OF_DISTORTION = 0.6
 # So many of so many frames that another camera matrix explains are no chance: of twelve real boards
 # none has one.
 _OTHERS, _OF_THE_LAST = 3, 30
-# Frames are compared again after as many as before, and after so many at most: it takes 4 ms. Of
-# the last comparisons two must agree in another matrix to this part: three frames of a stabilized
-# film turn alike, too. Until then a focal length, as long as no comparison denies it, is believed.
-_RARELY, _COMPARISONS, _ALIKE = 192, 3, 0.2
+# Frames are compared again after as many as before, and after so many at most: it takes 5 to 30 ms.
+# Others follow sooner as long as these do not tell the focal length.
+_RARELY, _SOON = 192, 8
 # Frames whose shares of inliers differ more show different parts of the map.
 _SAME_SHARE = 0.8
 # Intervals (s) over which a parabola is a hand's motion.
@@ -58,7 +57,7 @@ class LensWatch:
     def __init__(self, exposure: Exposure | None, config: LocalizerConfig) -> None:
         self._least = _OF_DISTORTION * config.calibration.distortion
         self._exposure, self._threshold = exposure, config.inlier_threshold
-        self._declared = config.calibration.aspect_ratio, config.map_deviation
+        self._config = config
         self.reset()
 
     def reset(self) -> None:
@@ -67,20 +66,15 @@ class LensWatch:
         self._sizes: deque[tuple[float, float]] = deque(maxlen=_FRAMES)
         self._others: deque[str] = deque(maxlen=_OF_THE_LAST)
         self._posed: deque[Fitted] = deque(maxlen=FRAMES)
-        self._found: deque[Matrix | None] = deque(maxlen=_COMPARISONS)
-        self._squeeze = 0.0  # logarithm of fy over fx, over K's, as it was last found
+        self._together: FramesTogether | None = None
+        if self._exposure is not None:
+            self._together = FramesTogether(self._exposure, self._config)
         self._count, self._next = 0, FRAMES
 
     @property
     def matrix(self) -> Matrix | None:
-        """The camera matrix that the last frames show instead of K; None: K may be right."""
-        last = self._found[-1] if self._found else None
-        if last and last.focal_length != 1.0:
-            return last
-        found = [np.log(matrix) for matrix in self._found if matrix]
-        if len(found) < 2 or not _agree(found[-1], found[-2]):
-            return None
-        return [matrix for matrix in self._found if matrix][-1]
+        """The camera matrix that frames show instead of K; None: K may be right."""
+        return None if self._together is None else self._together.matrix
 
     @property
     def fault(self) -> str:
@@ -98,16 +92,16 @@ class LensWatch:
         return others[-1] if len(others) >= _OTHERS else ""
 
     def widened(self, found: Estimate) -> Estimate:
-        """Return a frame with a covariance that allows for a matrix that was found, if only once.
+        """Return a frame with a covariance that allows for fy over fx as frames have it.
 
         A camera whose fy over fx is off by ``s`` reads that as a pitch rate of ``s`` times the
         height over the focal length.
         """
-        if not self._squeeze or self._exposure is None:
+        if self._exposure is None or self._together is None or not self._together.squeeze:
             return found
         (camera,) = self._exposure.cameras
         axis = int(camera.scan_direction not in VERTICAL)
-        rate = self._squeeze * camera.size[1 - axis] / camera.focal_length
+        rate = self._together.squeeze * camera.size[1 - axis] / camera.focal_length
         calibration = found.calibration_covariance.copy()
         calibration[ANGULAR, ANGULAR][axis, axis] += rate**2
         return replace(found, calibration_covariance=calibration)
@@ -147,7 +141,7 @@ class LensWatch:
 
     def _compare(self, frame: Fitted) -> None:
         """Compare the last frames with each other, now and then."""
-        if self._exposure is None:
+        if self._together is None:
             return
         seconds = 1e-9 * (frame.time_ns - self._posed[-1].time_ns) if self._posed else 0.0
         if self._posed and not 0.0 < seconds < _LONGEST_INTERVAL:
@@ -159,12 +153,9 @@ class LensWatch:
         shares = [float(np.mean(each.found.inliers)) for each in self._posed]
         if min(shares) < _SAME_SHARE * max(shares):
             return
-        found = another_matrix(self._exposure, self._posed, *self._declared)
-        self._found.append(found)
-        if found:
-            self._squeeze = math.log(found.aspect_ratio)
-        doubtful = sum(matrix is not None for matrix in self._found) == 1
-        self._next = self._count + (FRAMES if doubtful else min(self._count, _RARELY))
+        self._together.add(list(self._posed))
+        most = _RARELY if self._together.is_enough else _SOON
+        self._next = self._count + min(self._count, most)
 
     def is_beyond(self, found: Estimate) -> bool:
         """Return whether one frame's smooth error is beyond what is declared."""
@@ -173,8 +164,3 @@ class LensWatch:
     def _allowed(self, declared: float) -> float:
         """Return the largest smooth error (px, rms) that deviations allow."""
         return max(_BEYOND * declared, self._least)
-
-
-def _agree(one: Array, other: Array) -> bool:
-    """Return whether two matrices (2,) are off alike; logarithms of parts of K."""
-    return bool(np.linalg.norm(one - other) < _ALIKE * np.linalg.norm(one))

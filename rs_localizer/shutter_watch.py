@@ -80,6 +80,9 @@ _GLOBAL = 0.2
 # of so many at least, neighbours correlate by more than this. Vibration changes its sign from frame
 # to frame, unless it has the images' rate.
 _TAKEN_OUT, _LAST, _LEAST, _SMOOTHLY = 3.5 * _LIKE_MOTION, 30, 12, 0.6
+# Orientations widen by what such rates turn in this time (s): a hand sways at 0.8 Hz. Before it is
+# named, they do so if rows also show a readout time that is longer by this factor.
+_SWAY, _LONGER = 0.2, 1.25
 # Logarithms of the odds of another shutter at which it is doubted, no longer doubted (a robot that
 # drives slowly shows neither) and certain, and of rest before a global shutter.
 _SUSPICIOUS, _SHOWN, _CERTAIN, _AT_REST = 4.0, -2.0, 8.0, 20.7
@@ -164,7 +167,7 @@ class ShutterWatch:
         self._of_ways = np.zeros(2)
         # What images turn within their rows beside the motion between them, rad per readout
         self._beside: deque[Array] = deque(maxlen=_LAST)
-        self._taken_out = np.zeros((3, 3))  # rad^2, of the angles that a stabilizer takes out
+        self._taken_out = 0.0  # rad, deviation of the angles that a stabilizer takes out
         self._frames = 0
         if self._camera is not None:
             self._mean, self._covariance = np.zeros(14), self._any
@@ -182,9 +185,9 @@ class ShutterWatch:
 
     def widened(self, found: Estimate) -> Estimate:
         """Return the last frame with a covariance that allows for what the watch has found."""
-        if self._taken_out.any():
+        if self._taken_out:
             calibration = found.calibration_covariance.copy()
-            calibration[TURN, TURN] += self._taken_out
+            calibration[TURN, TURN] += self._taken_out**2 * np.eye(3)
             found = replace(found, calibration_covariance=calibration)
         if not (self._reversed or self._across):
             return found
@@ -318,34 +321,39 @@ class ShutterWatch:
         changed = float(np.mean(step[8:] ** 2 / wanders.diagonal()))
         changed = min(changed, _MOST_UNLIKELY * self._unlike)
         self._unlike = max(self._unlike + _LEARNING * (changed - self._unlike), 1.0)
-        self._taken_out[:] = 0.0
         usual = self._camera.readout_time
+        rate = self._turned_beside()
         if self._unlike < _SHAKEN and np.all(np.abs(self._mean[:2]) < 0.55 * seconds):
             self._judge(usual)
+            rate *= self._mean[0] > _LONGER * usual
         elif self.kind in ("", "stabilized"):
             self.trusted, self._reversed, self._across = True, False, False
-            self._judge_stabilizer(0.5 * seconds)
+            self._name_stabilizer(rate)
+        self._taken_out = _SWAY * rate if self.kind in ("", "stabilized") else 0.0
 
-    def _judge_stabilizer(self, interval: float) -> None:
-        """Judge whether images are turned as a whole: no shutter turns them as they are."""
+    def _turned_beside(self) -> float:
+        """Return the rate (rad/s, rms) at which images are turned as wholes; 0: they are not."""
         assert self._camera is not None
-        per_frame = interval / self._camera.readout_time
-        beside = per_frame * np.array(self._beside)
-        beside -= beside.mean(axis=0)
-        angles, square = np.cumsum(beside, axis=0), float(np.sum(beside**2))
-        turned = math.sqrt(square / len(beside))  # rad per frame
-        smoothly = float(np.sum(beside[1:] * beside[:-1])) > _SMOOTHLY * square
+        beside = np.array(self._beside)
+        if len(beside) < 2:
+            return 0.0
+        if len(beside) >= _LEAST:
+            beside -= beside.mean(axis=0)
+        turned = math.sqrt(float(np.mean(np.sum(beside**2, axis=1))))  # rad per readout
+        smoothly = np.mean(np.sum(beside[1:] * beside[:-1], axis=1)) > _SMOOTHLY * turned**2
+        return turned / self._camera.readout_time if smoothly and turned > _TAKEN_OUT else 0.0
+
+    def _name_stabilizer(self, rate: float) -> None:
+        """Name images that are turned as wholes: no shutter turns them as they are."""
         self.kind, self.fault = "", ""
-        if len(beside) < _LEAST or not (smoothly and turned > _TAKEN_OUT * per_frame):
+        if rate == 0.0 or len(self._beside) < _LEAST:
             return
-        angles -= angles[-1]  # one of them, nobody knows which, is none
-        self._taken_out += angles.T @ angles / len(angles)
         self.kind = "stabilized"
         self.fault = (
-            f"rows show rotations that differ by {math.degrees(turned / interval):.0f} deg/s (rms) "
-            "from those between images, which no shutter does: is the film stabilized? Poses are "
-            "those of the picture that it shows; switch stabilization off (a camera that vibrates "
-            "at the image rate looks the same)"
+            f"rows show rotations that differ by {math.degrees(rate):.0f} deg/s (rms) from those "
+            "between images, which no shutter does: is the film stabilized? Poses are those of the "
+            "picture that it shows; switch stabilization off (a camera that vibrates at the image "
+            "rate looks the same)"
         )
 
     def _along(self, axis: int) -> MeasuredReadout:

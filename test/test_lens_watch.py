@@ -68,12 +68,17 @@ def test_three_frames_that_another_matrix_explains_refuse_all_until_they_are_old
     [
         ("right: board", 110, ""),
         ("f of 1.9 times, board", 12, "a focal length 0.5"),
+        ("f of 0.6 times, facing board", 60, "a focal length 1.6"),
+        ("right: facing board", 110, ""),
         ("squeezed by 2 %, corner", 110, "fy over fx 0.98 times K's"),
         ("squeezed by 25 %, corner", 12, "fy over fx 0.75 times K's"),
     ],
 )
-def test_what_motion_hides_within_a_frame_three_frames_together_tell(name, published, said):
-    """Of 120 frames; of the three that the first comparison takes, nobody knows."""
+def test_what_motion_hides_within_a_frame_frames_together_tell(name, published, said):
+    """Of 120 frames; of the three that the first comparison takes, nobody knows.
+
+    Three neighbours before a board that stays face-on fit any focal length.
+    """
     (kind,) = [kind for kind in kinds() if kind.name == name]
     tallies = [judged(kind, seed) for seed in (3, 4)]
     count = sum(tally.published for tally in tallies)

@@ -1,29 +1,34 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Another camera matrix than K, from three frames together.
+"""Another camera matrix than K, from what frames of a track together say.
 
 Within one frame before a plane, motion takes up what a wrong focal length leaves. Between frames
-the same camera moves: a parabola through the poses of three frames is how it moves within each
-of them. So each frame has a pose only, and all of them share
+the same camera moves: a parabola through the poses of three neighbours is how it moves within each
+of them, but for a change of acceleration. So three neighbours have poses, a stamp and that change
+for themselves, and share with all other threes of the track
 
-    the readout time, the stamp of the middle one, the focal length, and fy over fx,
+    the readout time, the focal length, fy over fx, and small errors of lens and map,
 
-as parts of what is given. A readout time or a stamp that is off is no fault of K and is left free;
-beside them three frames tell a focal length to 1 %, and fy over fx to 0.1 %.
+of which each three says what is left of its equations without its own unknowns. A board that
+faces the camera tells a focal length by how it is foreshortened, which grows with the square of
+the angle: what one three hardly tells, some from different angles do.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
 
+from rs_localizer.config import LocalizerConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.lens import centre_of
 from rs_localizer.core.rig import Exposure
+from rs_localizer.core.state import MOVE, VELOCITIES
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.points import Observations, find_usable, packed
 from rs_localizer.estimation.projection import linearized
@@ -32,26 +37,50 @@ FRAMES = 3
 """Frames that are compared: through them goes one parabola."""
 # Points of a frame: more take longer than they are worth.
 _MOST = 60
-# Steps of Gauss and Newton, the last of which moves no number and no angle by more than this.
-_ROUNDS, _LEAST_STEP = 12, 1e-4
+# Threes that are kept: those that tell most of the focal length (its logarithm). It is known if its
+# deviation is less than the second.
+_KEPT, _KNOWN = 8, 0.02
+# Rounds of Gauss and Newton, the last of which moves no pose and no number by more than this. A
+# three is linearized anew if the shared numbers are farther away than the last.
+_ROUNDS, _LEAST_STEP, _NEAR = 12, 1e-3, (0.3, 0.05, 0.02)
 _LEAST_NOISE = 0.1  # px, no real error is smaller
+# So many threes in a row that do not fit those before are no chance.
+_ODD = 2
 # Focal lengths from which the search also starts, over K's.
 _LENGTHS = (0.6, 1.7)
-# The largest step of a number: beyond it the linear terms no longer hold.
-_MOST_STEP = 0.3
-# Deviations of readout time, stamp (of an interval: drivers stamp when an image arrives, or count
-# images of which some were lost), focal length and fy over fx (logarithms) of any camera.
-_OTHER = np.array([3.0, 0.2, 1.0, 0.1])
-# Numbers that are no fault of K, and all.
-_GIVEN, _NUMBERS = 2, 4
-# Deviation of the focal length of this very camera: also of one that is bent or lies before a map
-# that is (:mod:`.left_out`).
-_USUAL = 0.01
-# No fy over fx is known better than to this.
-_EXACT = 1e-4
-# Gain in the logarithm of the evidence for each point and frame, from which another matrix is
-# believed: right ones gain 0.0, boards of paper at most 0.27 (12 videos), wrong ones 2 to 9.
-_EACH = 1.0
+# The largest step of a number: beyond it the linear terms no longer hold; usual steps of the first
+# three, which may hardly be told, are smaller.
+_MOST_STEP, _DAMPING = 0.3, np.diag(np.r_[np.full(3, 100.0), np.zeros(8)])
+# Numbers of a three: poses, the stamp of the middle frame (drivers stamp when an image arrives, or
+# count images of which some were lost; of an interval), and the velocities beside the parabola.
+_OWN, _STAMP, _BESIDE = 25, 18, slice(19, 25)
+_OF_STAMP = 0.2
+# A third derivative adds to the velocities in the middle frame, and minus twice as much in the
+# others. A hand's is by this part of how far the velocities between the frames differ, or by so
+# much, rad or shares of the depth per readout.
+_CUBIC, _OF_CHANGE, _LIKE_MOTION = (-2.0, 1.0, -2.0), 0.15, 0.002
+# Shared numbers: readout time, focal length and fy over fx (logarithms) of any camera; errors of
+# the lens (principal point, px, and distortion at the corners, px); and of the map, over its
+# extent: bends and stretches (printed boards have 0.3 %).
+_READOUT, _LENGTH, _RATIO, _LENS, _MAP = 0, 1, 2, slice(3, 6), slice(6, 11)
+_ANY = (3.0, 1.0, 0.1)
+_BENT, _SHARED = 0.003, 11
+_OF_K = slice(_LENGTH, _RATIO + 1)
+# Landmarks farther away than this many extents are moved like those there.
+_FAR = 2.0
+# A focal length, and fy over fx, are others than K's beyond this many deviations, and may be so
+# beyond the second. The deviation of the focal length of this very camera has the third beside what
+# is declared: who calibrates a moving camera without its shutter is off by up to 2.8 % (twelve real
+# boards). No fy over fx is known better than to the last.
+_SURELY, _DOUBTFULLY, _USUAL, _EXACT = 4.0, 2.0, 0.01, 1e-4
+# If the readout time is off by more than this (logarithm), rows and images move otherwise, and
+# nothing is told of fy over fx.
+_TURNED = 0.25
+# Errors of corners are alike in neighbouring images: before twelve real boards focal lengths are
+# off by up to 4.3 deviations without this factor, by 2.8 with it.
+_ALIKE = 1.6
+# Frames together may leave so many times the variance (px^2) that each leaves alone.
+_AS_GOOD = math.e
 # fy over fx changes as each changes by a half, the other way.
 _ASPECT = np.array([-0.5, 0.5])
 
@@ -87,6 +116,31 @@ class Matrix(NamedTuple):
         )
 
 
+class _Landmarks(NamedTuple):
+    """In which directions a map may be bent and stretched."""
+
+    centre: Array  # (3,)
+    axes: Array  # (3,3) rows; the last is that of the least extent
+    extent: float  # m
+
+    @classmethod
+    def of(cls, points: Array) -> _Landmarks:
+        centre = np.median(points, axis=0)
+        _, sizes, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+        return cls(centre, axes, math.sqrt(2.0 / len(points)) * float(sizes[0]))
+
+    def modes(self, points: Array) -> Array:
+        """Return how points (n,3) beside the centre move (n,3,5) by errors of one extent."""
+        along, across = np.clip(points @ self.axes[:2].T / self.extent, -_FAR, _FAR).T
+        bends = np.column_stack([along**2, along * across, across**2])
+        one, other, out = self.axes
+        stretched = np.outer(along, one) - np.outer(across, other)
+        sheared = np.outer(along, other) + np.outer(across, one)
+        bent = out[:, None] * bends[:, None, :]
+        modes: Array = self.extent * np.dstack([bent, stretched, sheared])
+        return modes
+
+
 class _Linked(NamedTuple):
     """A frame on its way; the motion within it is that through the poses of two others."""
 
@@ -94,6 +148,7 @@ class _Linked(NamedTuple):
     others: tuple[int, int]
     away: Array  # (2,) times to the others, readouts
     shifted: Array  # (2,) their derivatives by the stamp of the middle frame
+    moved: Array  # (n,3,5) points by errors of the map
 
 
 def _slopes(away: Array) -> Array:
@@ -104,76 +159,314 @@ def _slopes(away: Array) -> Array:
     return slopes
 
 
-class _Fit(NamedTuple):
-    """Poses and numbers of a fit, and the errors that it leaves."""
+class _Equations(NamedTuple):
+    """The linear equations of a three for the shared numbers."""
 
-    poses: list[tuple[Array, Array]]  # rotation (3,3) camera_from_map and centre (3,)
-    numbers: Array  # (4,) beside those that are given
+    numbers: Array  # (11,) where
+    information: Array  # (11,11)
+    slope: Array  # (11,)
+    step: Array  # (25,) of its own numbers, if the shared ones stay
+    by_shared: Array  # (25,11) and by these
     squared_errors: Array  # (n,) px^2
 
 
-@np.errstate(all="ignore")  # a start that leads nowhere
-def another_matrix(
-    exposure: Exposure, posed: Sequence[Fitted], aspect_ratio: float, map_deviation: float
-) -> Matrix | None:
-    """Return the matrix that frames tell to be the camera's instead of K; None: K may be right.
+class _Three:
+    """Three neighbours with their own unknowns."""
+
+    def __init__(
+        self, exposure: Exposure, posed: Sequence[Fitted], map_: _Landmarks, length: float
+    ) -> None:
+        # By the logarithm of another focal length the points are farther away.
+        (camera,) = exposure.cameras
+        self.posed, self._focal_length = posed, camera.focal_length
+        self._corner = 0.5 * math.hypot(*camera.size) / camera.focal_length
+        self.frames = _frames(exposure, posed, map_)
+        self.poses = []
+        for each in posed:
+            turn, place = each.found.rotation, each.found.position - map_.centre
+            self.poses.append((turn, turn.T @ ((turn @ place) * [1.0, 1.0, math.exp(length)])))
+        self.own = np.zeros(_OWN)  # that of the poses stays zero
+        residuals = np.concatenate([each.found.residuals[each.found.inliers] for each in posed])
+        self.variance = _variance(residuals**2)  # px^2, that each frame leaves alone
+        self.equations: _Equations | None = None
+
+    @property
+    def depth(self) -> float:
+        """Median depth (m) of the points."""
+        turn, place = self.poses[1]
+        return abs(float(np.median((self.frames[1].seen.points - place) @ turn[2])))
+
+    def is_stale(self, numbers: Array) -> bool:
+        """Return whether the linear terms no longer hold at these shared numbers (11,)."""
+        if (there := self.equations) is None:
+            return True
+        near = np.abs((numbers - there.numbers)[:3]) < _NEAR
+        return not (near.all() and np.abs(there.step[:_STAMP]).max() < _LEAST_STEP)
+
+    def linearize(self, numbers: Array, principal: Array, least: float) -> None:
+        """Linearize at these shared numbers (11,), where its own ones move to.
+
+        ``principal`` (2,): the principal point, in focal lengths, which moves with the focal length
+        if the image has another size; zero: it does not. ``least``: px^2, variance of the noise.
+        """
+        if (there := self.equations) is not None:
+            self._move(there.step + there.by_shared @ (numbers - there.numbers))
+        lines = [self.lines(k, numbers, principal) for k in range(FRAMES)]
+        errors, columns = (np.concatenate(part) for part in zip(*lines, strict=True))
+        squared = np.square(errors).sum(axis=1)
+        squared = np.where(np.isnan(squared), np.inf, squared)
+        near = np.isfinite(columns).all(axis=(1, 2)) & np.isfinite(squared)
+        variance = max(_variance(squared), least)
+        weights = np.repeat(1.0 / (variance + squared[near] / 9.0), 2)
+        rows, off = columns[near].reshape(-1, _OWN + _SHARED), errors[near].ravel()
+        weighed = rows.T * weights
+        every, slope = weighed @ rows, weighed @ off
+        known = self._known()
+        own = every[:_OWN, :_OWN] + np.diag(known)
+        crossed, pull = every[:_OWN, _OWN:], slope[:_OWN] + known * self.own
+        gain = np.linalg.solve(own, np.column_stack([crossed, pull]))
+        self.equations = _Equations(
+            numbers,
+            every[_OWN:, _OWN:] - crossed.T @ gain[:, :-1],
+            slope[_OWN:] - crossed.T @ gain[:, -1],
+            -gain[:, -1],
+            -gain[:, :-1],
+            squared,
+        )
+
+    def _known(self) -> Array:
+        """Return what is known of its own numbers beforehand, as information (25,)."""
+        frame = self.frames[1]
+        before, after = (
+            self._way(1, other) / away
+            for other, away in zip(frame.others, frame.away, strict=True)
+        )  # fmt: skip
+        change = _OF_CHANGE * np.linalg.norm((after - before).reshape(2, 3), axis=1)
+        deviation = np.hypot(change, _LIKE_MOTION * np.array([1.0, self.depth]))
+        beside = np.repeat(deviation, 3) ** -2.0
+        known: Array = np.concatenate([np.full(_STAMP, 1e-9), [_OF_STAMP**-2], beside])
+        return known
+
+    def _way(self, k: int, other: int) -> Array:
+        """Return rotation vector and way (6,) from a frame to another, in the axes of the first."""
+        (turn, place), (others_turn, others_place) = self.poses[k], self.poses[other]
+        turned = so3.log(np.ascontiguousarray(turn @ others_turn.T))
+        way: Array = np.concatenate([turned, turn @ (others_place - place)])
+        return way
+
+    def _move(self, step: Array) -> None:
+        self.poses = [
+            (np.ascontiguousarray(so3.exp(-turn) @ rotation), place + rotation.T @ move)
+            for (rotation, place), (turn, move) in zip(
+                self.poses, step[:_STAMP].reshape(-1, 2, 3), strict=True
+            )
+        ]
+        self.own = self.own + np.r_[np.zeros(_STAMP), step[_STAMP:]]
+
+    def lines(self, k: int, numbers: Array, principal: Array) -> tuple[Array, Array]:
+        """Return errors (n,2) of a frame, and their derivatives (n,2,36) by own and shared ones."""
+        frame, (rotation, place) = self.frames[k], self.poses[k]
+        ways = np.array([self._way(k, other) for other in frame.others])
+        more, longer, aspect = numbers[:3]
+        readout, away = 1.0 + more, frame.away + self.own[_STAMP] * frame.shifted
+        scale, length = np.exp(longer + aspect * _ASPECT), math.exp(longer)
+        shift = (length - 1.0) * principal
+        seen, per_time = frame.seen, readout ** np.array([1.0, 2.0])
+        through = Observations.of(
+            seen.points, (seen.rays - shift) / scale, seen.tau, seen.by_ray * scale, seen.mounts,
+            seen.camera,
+        )  # fmt: skip
+        by_way = _slopes(away)
+        speeds = per_time[:, None] * (by_way @ ways)
+        shifts = frame.shifted[:, None] * np.column_stack([np.ones(2), away])
+        by_stamp = -per_time[:, None] * (by_way @ shifts @ by_way @ ways)
+        moving = speeds + np.outer([_CUBIC[k], 0.0], self.own[_BESIDE])
+        state = np.concatenate([rotation.ravel(), -rotation @ place, moving.ravel()])
+        lines = linearized(through.packed, len(through), state, np.zeros((len(through), 6)))
+        by_number = np.zeros((lines.by_motion.shape[2], _OWN + 1))  # of the motion within the frame
+        own = slice(6 * k, 6 * k + 6)
+        by_number[:6, own] = np.eye(6)
+        for way, other, slopes in zip(ways, frame.others, by_way.T, strict=True):
+            turn = rotation @ self.poses[other][0].T
+            about = np.linalg.inv(so3.right_jacobian(-way[:3]))
+            by_own, by_other = -np.eye(6), np.zeros((6, 6))
+            by_own[:3, :3], by_own[3:, :3] = -about, so3.hat(way[3:])
+            by_other[:3, :3], by_other[3:, 3:] = about @ turn, turn
+            for part, weight in enumerate(per_time * slopes, start=1):
+                rows = slice(6 * part, 6 * part + 6)
+                by_number[rows, own] += weight * by_own
+                by_number[rows, 6 * other : 6 * other + 6] = weight * by_other
+        by_number[6:, _STAMP] = by_stamp.ravel()
+        by_number[VELOCITIES, _BESIDE] = _CUBIC[k] * np.eye(6)
+        by_number[6:, _OWN + _READOUT] = (speeds * [[1.0], [2.0]]).ravel() / readout
+        columns = np.zeros((len(through), 2, _OWN + _SHARED))
+        columns[:, :, : _OWN + 1] = lines.by_motion @ by_number
+        shared = columns[:, :, _OWN:]
+        by_length = through.by_ray * lines.image[:, None, :]
+        shared[:, :, _LENGTH] = by_length.sum(axis=2) + seen.by_ray @ (length * principal)
+        shared[:, :, _RATIO] = by_length @ _ASPECT
+        radial = seen.rays * np.square(seen.rays).sum(axis=1, keepdims=True) / self._corner**3
+        shared[:, [0, 1], [_LENS.start, _LENS.start + 1]] = 1.0
+        shared[:, :, _LENS.stop - 1] = np.einsum("nij,nj->ni", seen.by_ray, radial)
+        shared[:, :, _LENS.stop - 1] /= self._focal_length
+        shared[:, :, _MAP] = lines.by_motion[:, :, MOVE] @ rotation @ frame.moved
+        errors = lines.errors + shared[:, :, _LENS.start :] @ numbers[_LENS.start :]
+        return errors, columns
+
+
+class _Fit(NamedTuple):
+    """Shared numbers that all threes tell, and what is left."""
+
+    numbers: Array  # (11,)
+    deviations: Array  # (11,)
+    variance: float  # px^2
+    cost: float
+
+
+_NO_FIT = _Fit(np.zeros(_SHARED), np.zeros(_SHARED), math.inf, math.inf)
+
+
+class FramesTogether:
+    """Adds up the equations of threes, and compares K with what they tell.
 
     Args:
         exposure: of a camera alone that moves while rows are read.
-        posed: of three frames, in their order.
-        aspect_ratio: declared deviation of fy over fx.
-        map_deviation: m, as declared.
+        config: with the deviations of calibration and map.
     """
-    centre = np.median(posed[0].points, axis=0)
-    frames = _frames(exposure, posed, centre)
-    poses = [(each.found.rotation, each.found.position - centre) for each in posed]
-    own = np.concatenate([each.found.residuals[each.found.inliers] for each in posed])
-    depth = np.median(frames[0].seen.points @ poses[0][0][2]) - poses[0][0][2] @ poses[0][1]
-    of_map = map_deviation * exposure.cameras[0].focal_length / float(depth)
-    least = _LEAST_NOISE**2 + of_map**2
-    most = math.exp(_EACH) * max(_variance(own**2), least)
-    size = 6 * len(frames) + _GIVEN
-    given = _fitted(frames, _Fit(poses, np.zeros(_NUMBERS), np.zeros(0)), _GIVEN)
-    hidden = _variance(given.squared_errors) > most  # or each frame hides what is wrong
-    near = _fitted(frames, given, _NUMBERS, rounds=1)
-    if not hidden and not _told(near, aspect_ratio).any():  # the first step would tell
-        return None
-    fits = [_fitted(frames, near, _NUMBERS)]
-    if hidden:
-        camera = exposure.cameras[0]
-        middles = np.zeros(2), centre_of(camera) / camera.focal_length
-        starts = [given, *(_scaled(poses, length) for length in _LENGTHS)]
-        fits += [_fitted(frames, start, _NUMBERS, each) for each in middles for start in starts]
-    other = max(fits, key=lambda fit: _evidence(fit, size + 2, least))
-    if not _variance(other.squared_errors) < most:  # it leaves more than frames do
-        return None
-    told = _told(other, aspect_ratio)
-    gain = _evidence(other, size + 2, least) - _evidence(given, size, least)
-    if not (told.any() and gain > _EACH * len(other.squared_errors)):  # NaN is not
-        return None
-    length, aspect = np.where(told, np.exp(other.numbers[_GIVEN:]), 1.0).tolist()
-    return Matrix(length, aspect)
+
+    def __init__(self, exposure: Exposure, config: LocalizerConfig) -> None:
+        given = config.calibration
+        self._exposure, self._map_deviation = exposure, config.map_deviation
+        self._of_lens = given.principal_point, given.principal_point, given.distortion
+        usual = math.hypot(_USUAL, given.focal_length), max(given.aspect_ratio, _EXACT)
+        self._usual = np.array(usual)
+        self._threes: list[_Three] = []
+        self._map: _Landmarks | None = None
+        self._principal, self._odd = np.zeros(2), 0
+        self._fit: _Fit | None = None
+        self.matrix: Matrix | None = None
+        """The matrix that frames tell to be the camera's instead of K; None: K may be right."""
+        self.squeeze = 0.0
+        """Logarithm of fy over fx, over K's, if frames doubt it."""
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether further threes tell hardly more: soon no more than now."""
+        if self._fit is None or self._odd:
+            return True
+        return len(self._threes) == _KEPT or bool(self._fit.deviations[_LENGTH] < _KNOWN)
+
+    @np.errstate(all="ignore")  # a start that leads nowhere
+    def add(self, posed: Sequence[Fitted]) -> None:
+        """Take three neighbours, in their order."""
+        if self._map is None:
+            self._map = _Landmarks.of(posed[0].points)
+        before = np.zeros(_SHARED) if self._fit is None else self._fit.numbers
+        newest = _Three(self._exposure, posed, self._map, before[_LENGTH])
+        threes, principal = [*map(copy, self._threes), newest], self._principal
+        fit = self._fitted(threes, before, principal)
+        if not self._fits(fit, threes):
+            self._odd += 1
+            if self._threes and self._odd < _ODD:  # by chance
+                return
+            fit, threes, principal = self._from_anywhere([three.posed for three in threes])
+            if not (threes and self._fits(fit, threes)):  # it leaves more than frames do
+                return
+        self._odd = 0
+        self._threes, self._fit, self._principal = threes, fit, principal
+        if len(threes) > _KEPT:
+            del self._threes[self._least()]
+        told = self._told(fit, _SURELY)
+        ratios = np.where(told, np.exp(fit.numbers[_OF_K]), 1.0)
+        self.matrix = Matrix(*ratios.tolist()) if told.any() else None
+        self.squeeze = float(fit.numbers[_RATIO]) if self._told(fit, _DOUBTFULLY)[1] else 0.0
+
+    def _told(self, fit: _Fit, least: float) -> Array:
+        """Return whether focal length and fy over fx (2,) are off by so many deviations."""
+        told: Array = np.abs(fit.numbers[_OF_K]) > least * np.hypot(
+            fit.deviations[_OF_K], self._usual
+        )
+        # Rows of a squeezed image take as long as before; images that are turned as wholes look
+        # squeezed, too.
+        longer, aspect = math.log1p(max(fit.numbers[_READOUT], -0.9)), fit.numbers[_RATIO]
+        told[1] &= abs(longer + aspect) < _TURNED
+        return told
+
+    def _from_anywhere(self, posed: Sequence[Sequence[Fitted]]) -> tuple[_Fit, list[_Three], Array]:
+        """Return the best fit from other focal lengths, as each frame may hide what is wrong."""
+        assert self._map is not None
+        camera, best = self._exposure.cameras[0], (_NO_FIT, list[_Three](), np.zeros(2))
+        for principal in (np.zeros(2), centre_of(camera) / camera.focal_length):
+            for length in (0.0, *map(math.log, _LENGTHS)):
+                threes = [_Three(self._exposure, each, self._map, length) for each in posed]
+                start = length * np.eye(_SHARED)[_LENGTH]
+                fit = self._fitted(threes, start, principal)
+                if fit.cost < best[0].cost:
+                    best = fit, threes, principal
+            if best[1] and self._fits(*best[:2]):
+                break
+        return best
+
+    def _fits(self, fit: _Fit, threes: Sequence[_Three]) -> bool:
+        """Return whether no more is left than frames leave, and no lens or map is impossible."""
+        own = float(np.median([three.variance for three in threes]))
+        squared = fit.numbers[_LENS.start :] ** 2 * self._known()[_LENS.start :]
+        near = fit.variance < _AS_GOOD * max(own, self._least_variance(threes))
+        return bool(near and squared.max() < _SURELY**2)
+
+    def _least_variance(self, threes: Sequence[_Three]) -> float:
+        of_map = self._map_deviation * self._exposure.cameras[0].focal_length / threes[-1].depth
+        return float(_LEAST_NOISE**2 + of_map**2)
+
+    def _known(self) -> Array:
+        """Return the information (11,) on shared numbers before any frame."""
+        assert self._map is not None
+        bent = math.hypot(_BENT, self._map_deviation / self._map.extent)
+        of_map = np.full(_MAP.stop - _MAP.start, bent)
+        deviations = np.concatenate([_ANY, self._of_lens, of_map])
+        known: Array = np.maximum(deviations, _EXACT) ** -2.0
+        return known
+
+    def _fitted(self, threes: Sequence[_Three], start: Array, principal: Array) -> _Fit:
+        """Return the fit of all threes, which move there."""
+        numbers, known, least = start, self._known(), self._least_variance(threes)
+        covariance: Array = np.diag(1.0 / known)
+        for _ in range(_ROUNDS):
+            stale = [three for three in threes if three.is_stale(numbers)]
+            for three in stale:
+                three.linearize(numbers, principal, least)
+            information: Array = np.diag(known)
+            slope = known * numbers
+            for three in threes:
+                there = three.equations
+                assert there is not None
+                information = information + there.information
+                slope = slope + there.slope + there.information @ (numbers - there.numbers)
+            try:
+                covariance[:] = np.linalg.inv(information)
+                step = -np.linalg.solve(information + _DAMPING, slope)
+            except np.linalg.LinAlgError:
+                break
+            farthest = float(np.abs(step[:3]).max())
+            if not math.isfinite(farthest):
+                break
+            numbers = numbers + step * min(1.0, _MOST_STEP / farthest)
+            if farthest < _LEAST_STEP and not stale:
+                break
+        squared = [three.equations.squared_errors for three in threes if three.equations]
+        variance = _variance(np.concatenate(squared))
+        cost = sum(float(np.log1p(each / (9.0 * least)).sum()) for each in squared)
+        return _Fit(numbers, _ALIKE * np.sqrt(np.diag(covariance)), variance, cost)
+
+    def _least(self) -> int:
+        """Return the three without which the focal length is known best."""
+        every = [three.equations.information for three in self._threes if three.equations]
+        total = np.diag(self._known()) + sum(every)
+        without = [np.linalg.inv(total - one)[_LENGTH, _LENGTH] for one in every]
+        return int(np.argmin(without))
 
 
-def _told(fit: _Fit, aspect_ratio: float) -> Array:
-    """Return whether focal length and fy over fx (2,) are those of any camera rather than K's."""
-    off, usual = fit.numbers[_GIVEN:], np.array([_USUAL, max(aspect_ratio, _EXACT)])
-    any_camera = _OTHER[_GIVEN:]
-    odds = 0.5 * ((off / usual) ** 2 - (off / any_camera) ** 2)
-    told: Array = odds > np.log(any_camera / usual)
-    return told
-
-
-def _scaled(poses: Sequence[tuple[Array, Array]], length: float) -> _Fit:
-    """Return a start with another focal length: the points are so much farther away."""
-    away = [
-        (rotation, rotation.T @ ((rotation @ place) * [1.0, 1.0, length]))
-        for rotation, place in poses
-    ]
-    return _Fit(away, np.array([0.0, 0.0, math.log(length), 0.0]), np.zeros(0))
-
-
-def _frames(exposure: Exposure, posed: Sequence[Fitted], centre: Array) -> list[_Linked]:
+def _frames(exposure: Exposure, posed: Sequence[Fitted], map_: _Landmarks) -> list[_Linked]:
     times = np.array([1e-9 * (each.time_ns - posed[0].time_ns) for each in posed]) / exposure.span
     frames = []
     for k, each in enumerate(posed):
@@ -181,134 +474,17 @@ def _frames(exposure: Exposure, posed: Sequence[Fitted], centre: Array) -> list[
         some = some[:: 1 + len(some) // _MOST]
         points, pixels = map(np.ascontiguousarray, (each.points[some], each.pixels[some]))
         usable = find_usable(exposure, points, pixels, [len(pixels)], None)
-        near = usable._replace(centre=centre)
-        middle = min(max(k, 1), len(posed) - 2)
-        others = sorted({middle - 1, middle, middle + 1} - {k})
-        interval = 0.5 * (times[middle + 1] - times[middle - 1])
-        shifted = interval * np.array([(each == middle) - float(k == middle) for each in others])
+        near = usable._replace(centre=map_.centre)
+        others = sorted({0, 1, 2} - {k})
+        interval = 0.5 * (times[2] - times[0])
+        shifted = interval * np.array([(each == 1) - float(k == 1) for each in others])
         seen = packed(exposure, points, near)
-        frames.append(_Linked(seen, (others[0], others[1]), times[others] - times[k], shifted))
+        moved = map_.modes(seen.points)
+        there = times[others] - times[k]
+        frames.append(_Linked(seen, (others[0], others[1]), there, shifted, moved))
     return frames
-
-
-def _fitted(
-    frames: Sequence[_Linked],
-    start: _Fit,
-    free: int,
-    middle: Array | None = None,
-    rounds: int = _ROUNDS,
-) -> _Fit:
-    """Return the fit of poses and of the first so many numbers.
-
-    ``middle`` (2,): the principal point, in focal lengths, which moves with the focal length if the
-    image has another size; None or zero: it does not.
-    """
-    middle = np.zeros(2) if middle is None else middle
-    fit, size = start, 6 * len(frames)
-    for _ in range(rounds):
-        lines = [_linearized(frames, fit, k, middle) for k in range(len(frames))]
-        squared = _squared(lines)
-        variance = _variance(squared)
-        known = np.r_[np.zeros(size), variance / _OTHER[:free] ** 2]
-        information = np.diag(known)
-        slope = known * np.r_[np.zeros(size), fit.numbers[:free]]
-        for errors, columns in lines:
-            rows = columns[:, :, : size + free]
-            near = np.isfinite(rows).all(axis=(1, 2)) & np.isfinite(errors).all(axis=1)
-            off, rows = errors[near], rows[near].reshape(-1, size + free)
-            weights = 1.0 / (1.0 + np.square(off).sum(axis=1) / (9.0 * variance))
-            weighed = rows.T * np.repeat(weights, 2)
-            information += weighed @ rows
-            slope += weighed @ off.ravel()
-        try:
-            step = -np.linalg.solve(information, slope)
-        except np.linalg.LinAlgError:
-            break
-        numbers = fit.numbers.copy()
-        numbers[:free] += np.clip(step[size:], -_MOST_STEP, _MOST_STEP)
-        poses = [
-            (np.ascontiguousarray(so3.exp(-turn) @ rotation), place + rotation.T @ move)
-            for (rotation, place), (turn, move) in zip(
-                fit.poses, step[:size].reshape(-1, 2, 3), strict=True
-            )
-        ]
-        fit = _Fit(poses, numbers, squared)
-        turns = step[:size].reshape(-1, 6)[:, :3]
-        if max(np.abs(step[size:]).max(), np.abs(turns).max()) < _LEAST_STEP:
-            return fit  # whose errors are those before the step: they differ by nothing that counts
-    lines = [_linearized(frames, fit, k, middle) for k in range(len(frames))]
-    return fit._replace(squared_errors=_squared(lines))
-
-
-def _squared(lines: Sequence[tuple[Array, Array]]) -> Array:
-    """Return the squared errors of all frames' points; infinite where there are none."""
-    squared = np.concatenate([np.square(errors).sum(axis=1) for errors, _ in lines])
-    return np.where(np.isnan(squared), np.inf, squared)
 
 
 def _variance(squared: Array) -> float:
     """Return the variance (px^2) of one coordinate, by the median of squared errors."""
     return max(float(np.median(squared)) / 1.386, _LEAST_NOISE**2)
-
-
-def _linearized(frames: Sequence[_Linked], fit: _Fit, k: int, middle: Array) -> tuple[Array, Array]:
-    """Return errors (n,2) of a frame, and their derivatives (n,2,m) by all poses and numbers."""
-    frame, (rotation, place) = frames[k], fit.poses[k]
-    turns = [rotation @ fit.poses[other][0].T for other in frame.others]
-    ways = np.array([
-        np.r_[so3.log(np.ascontiguousarray(turn)), rotation @ (fit.poses[other][1] - place)]
-        for turn, other in zip(turns, frame.others, strict=True)
-    ])  # fmt: skip
-    more, late, longer, aspect = fit.numbers
-    readout, away = 1.0 + more, frame.away + late * frame.shifted
-    scale, length = np.exp(longer + aspect * _ASPECT), math.exp(longer)
-    shift = (length - 1.0) * middle
-    seen, per_time = frame.seen, readout ** np.array([1.0, 2.0])
-    through = Observations.of(
-        seen.points,
-        (seen.rays - shift) / scale,
-        seen.tau,
-        seen.by_ray * scale,
-        seen.mounts,
-        seen.camera,
-    )
-    by_way = _slopes(away)
-    speeds = per_time[:, None] * (by_way @ ways)
-    shifts = frame.shifted[:, None] * np.column_stack([np.ones(2), away])
-    by_stamp = -per_time[:, None] * (by_way @ shifts @ by_way @ ways)
-    state = np.concatenate([rotation.ravel(), -rotation @ place, speeds.ravel()])
-    lines = linearized(through.packed, len(through), state, np.zeros((len(through), 6)))
-    size, own = 6 * len(frames), slice(6 * k, 6 * k + 6)
-    by_number = np.zeros(
-        (lines.by_motion.shape[2], size + _NUMBERS)
-    )  # of the motion within the frame
-    by_number[:6, own] = np.eye(6)
-    for turn, other, way, slopes in zip(turns, frame.others, ways, by_way.T, strict=True):
-        about = np.linalg.inv(so3.right_jacobian(-way[:3]))
-        by_own, by_other = -np.eye(6), np.zeros((6, 6))
-        by_own[:3, :3], by_own[3:, :3] = -about, so3.hat(way[3:])
-        by_other[:3, :3], by_other[3:, 3:] = about @ turn, turn
-        for part, weight in enumerate(per_time * slopes, start=1):
-            rows = slice(6 * part, 6 * part + 6)
-            by_number[rows, own] += weight * by_own
-            by_number[rows, 6 * other : 6 * other + 6] = weight * by_other
-    by_number[6:, size] = (speeds * [[1.0], [2.0]]).ravel() / readout
-    by_number[6:, size + 1] = by_stamp.ravel()
-    columns = lines.by_motion @ by_number
-    by_length = through.by_ray * lines.image[:, None, :]
-    columns[:, :, size + 2] = by_length.sum(axis=2) + seen.by_ray @ (length * middle)
-    columns[:, :, size + 3] = by_length @ _ASPECT
-    return lines.errors, columns
-
-
-def _evidence(fit: _Fit, parameters: int, least: float) -> float:
-    """Return the log evidence of a fit, with outliers of little weight (Schwarz).
-
-    ``least``: px^2, variance that noise and map have in any case.
-    """
-    squared = fit.squared_errors
-    weights = 1.0 / (1.0 + squared / (9.0 * _variance(squared)))
-    inside = weights > 0.0
-    total, count = float(weights[inside] @ squared[inside]), len(squared)
-    variance = max(total / max(2.0 * weights.sum() - parameters, 1.0), least)
-    return -count * (math.log(variance) + 1.0) - 0.5 * parameters * math.log(2 * count)
