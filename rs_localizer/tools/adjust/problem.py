@@ -134,9 +134,9 @@ class Problem:
         parts = zip(self.keypoints, states, self.at, self.ratios.tolist(), strict=True)
         return [of.rows(curve, own, at, deviation * ratio) for of, own, at, ratio in parts]
 
-    def system(self, state: Unknowns, deviation: float) -> System:
+    def system(self, state: Unknowns, deviation: float, dense: bool = False) -> System:
         """Return the cost and normal equations at a standard deviation of the noise (px)."""
-        return System(self.groups, self.terms(state, deviation))
+        return System(self.groups, self.terms(state, deviation), dense)
 
     def terms(self, state: Unknowns, deviation: float) -> list[Rows | Quadratic]:
         """Return all measurements and priors."""

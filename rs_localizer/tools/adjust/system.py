@@ -105,9 +105,12 @@ class System:
     Args:
         groups: the unknowns.
         terms: rows, and priors of the border.
+        dense: the motion is dense even if it is a band, as covariances of blocks and modes need.
     """
 
-    def __init__(self, groups: Groups, terms: Sequence[Rows | Quadratic]) -> None:
+    def __init__(
+        self, groups: Groups, terms: Sequence[Rows | Quadratic], dense: bool = False
+    ) -> None:
         self.groups = groups
         rows = [term for term in terms if isinstance(term, Rows) and len(term.values)]
         known = [term for term in terms if isinstance(term, Quadratic)]
@@ -118,7 +121,7 @@ class System:
             reach = max(reach, _reach(self.blocks, groups.motion))
         self.slope = np.zeros(groups.kept)
         self.matrix: Array | Band  # (N,N) of a dense motion
-        if reach > _DENSE * groups.motion:
+        if dense or reach > _DENSE * groups.motion:
             self.matrix = np.zeros((groups.kept, groups.kept))
             for term in rows:
                 own = _sparse(term, groups.kept)

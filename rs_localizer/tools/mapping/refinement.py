@@ -179,7 +179,7 @@ class Refinement:
         used = self._freedoms(state.spline) + 3 * int(np.count_nonzero(images))
         inflation = inflation_of(squared[inliers], deviation, used + problem.border)
         inflation = self._cluster_robust(problem, deviation, inflation)
-        factored = Factored(problem.system(state, deviation))
+        factored = Factored(problem.system(state, deviation, dense=True))
         modes = np.zeros((problem.groups.kept, 0))
         if self.wanted.drifts:
             modes = DRIFT * math.sqrt(inflation) * factored.modes(self.wanted.drifts)

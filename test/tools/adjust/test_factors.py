@@ -142,7 +142,10 @@ def test_steps_and_covariances_are_those_of_the_dense_system(of, length):
     scale, factored = 1.0 / np.sqrt(np.diag(matrix)), Factored(system)
     inverse = np.linalg.inv(matrix * scale * scale[:, None]) * scale * scale[:, None]
     expected = -inverse @ slope
-    np.testing.assert_allclose(factored.step(), expected, atol=1e-5 * np.abs(expected).max())
+    dense = Factored(System(problem.groups, terms, dense=True))  # as a map's is, however long
+    for one in (factored, dense):
+        np.testing.assert_allclose(one.step(), expected, atol=1e-5 * np.abs(expected).max())
+    assert dense.modes(3).shape == (problem.groups.kept, 3)
     motion, kept = problem.groups.motion, problem.groups.kept
     border = inverse[motion:kept, motion:kept]
     scale = np.sqrt(np.diag(border))
