@@ -12,8 +12,7 @@ states are: right; wrong, and frames show it; wrong since a jump.
 
 No image can show that a room was moved as a whole before the first frame. Neither can an image of
 one wall show that the wall is a copy of another one. Landmarks that have disappeared do not make a
-pose wrong; :meth:`Integrity.stale` finds them. Frames match a part of a map that moved slightly;
-:attr:`Integrity.moved` names it.
+pose wrong; :meth:`Integrity.stale` finds them.
 """
 
 import math
@@ -23,10 +22,8 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
-from rs_localizer.core.rig import Exposure
 from rs_localizer.core.state import TURN
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.moved_part import Look, MovedPart, chosen, look_at, moved_part
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.native import entry
 
@@ -52,9 +49,6 @@ _KEY = np.sqrt([2.0, 3.0, 5.0])
 # A landmark has disappeared if an existing one would be missed as often with less than this
 # probability. Most landmarks that are remembered.
 _BY_CHANCE, _MOST_LANDMARKS = 1e-8, 20_000
-# Frames among which parts of the map are compared, and every how many frames one is taken: within
-# 0.7 s a hand has moved the view.
-_LOOKS, _EVERY = 8, 3
 # Bound of a frame's log odds.
 _MOST_ODDS = 8.0
 
@@ -135,16 +129,10 @@ class SeenLandmarks:
 
 
 class Integrity:
-    """The chance that a track is wrong, frame by frame.
+    """The chance that a track is wrong, frame by frame."""
 
-    Args:
-        exposure: of the camera; None: parts of a map are not compared.
-        map_deviation: m, as declared.
-    """
-
-    def __init__(self, exposure: Exposure | None = None, map_deviation: float = 0.0) -> None:
+    def __init__(self) -> None:
         self._seen = SeenLandmarks()
-        self._exposure, self._map_deviation = exposure, map_deviation
         self.reset()
 
     def reset(self) -> None:
@@ -152,30 +140,6 @@ class Integrity:
         # Probabilities of the three states after the last frame.
         self._chances = np.array([1.0 - sum(FIRST), *FIRST])
         self._is_first = True
-        self.moved: MovedPart | None = None
-        """The part of the map that was last found to lie elsewhere; None: no part was."""
-        self._looks: list[Look] = []
-        self._frames = 0
-
-    def look(self, estimate: Estimate, points: ArrayLike, pixels: ArrayLike) -> None:
-        """Take a frame of a camera alone to compare parts of the map.
-
-        Only frames whose smooth error is beyond what is declared are worth it: it takes 7 ms.
-        """
-        self._frames += 1
-        if self._exposure is None or self._frames % _EVERY:
-            return
-        every = np.asarray(points, float)
-        rows = chosen(every, np.asarray(estimate.inliers), self._looks)
-        seen = np.ascontiguousarray(every[rows]), np.asarray(pixels, float)[rows]
-        look = look_at(self._exposure, estimate, *seen)
-        if look is None:  # those that were compared have left the view
-            self._looks.clear()
-            return
-        self._looks.append(look)
-        if len(self._looks) == _LOOKS:
-            self.moved = moved_part(self._looks, self._map_deviation)
-            self._looks.clear()
 
     def stale(self, points: ArrayLike) -> BoolArray:
         """Return which landmarks (n,3) were seen too often to be unmatched by chance."""

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -39,7 +39,14 @@ from rs_localizer.estimation.calibration import (
 )
 from rs_localizer.estimation.hypotheses import Posterior, frame_posterior
 from rs_localizer.estimation.known_rotation import coupled_turn
-from rs_localizer.estimation.left_out import LeftOut, left_out
+from rs_localizer.estimation.left_out import LeftOut, left_nearby, left_out
+from rs_localizer.estimation.moved_part import (
+    Look,
+    MovedPart,
+    MovedParts,
+    look_at,
+    moved_part,
+)
 from rs_localizer.estimation.points import (
     NEAREST,
     Observed,
@@ -92,6 +99,7 @@ class _Inputs(NamedTuple):
     expected_share: float
     rotation: RotationPrior | None
     error_modes: ErrorModes | None
+    parts: MovedParts | None
 
 
 class Localizer:
@@ -212,11 +220,13 @@ class Localizer:
         rotation: RotationPrior | None = None,
         stamps: Mapping[str, float] | None = None,
         error_modes: ErrorModes | None = None,
+        parts: MovedParts | None = None,
     ) -> Estimate | Failure:
         """Localize as :meth:`localize`, however uncertain: the next frames may know better.
 
-        ``error_modes`` are those of the map of these points, if it has them; they enter
-        covariances. Arguments that ``refinement`` does not use are ignored.
+        ``error_modes`` are those of the map of these points, if it has them, and ``parts`` watches
+        whether parts of it have moved; they enter covariances. Arguments that ``refinement`` does
+        not use are ignored.
         """
         if not self._full:
             prior = rotation = None
@@ -226,7 +236,7 @@ class Localizer:
         if not 0.0 <= expected_share <= 1.0:
             raise ValueError(f"expected_share must lie between 0 and 1, got {expected_share}")
         sights = self._sights(points, pixels, scores, stamps)
-        given = _Inputs(*sights, prior, expected_share, rotation, error_modes)
+        given = _Inputs(*sights, prior, expected_share, rotation, error_modes, parts)
         if rotation is not None and not given.exposure.alone:
             raise ValueError("a known rotation is that of a camera alone, not of a rig")
         if rotation is not None:
@@ -266,7 +276,7 @@ class Localizer:
         return checked_of_rig(self.rig, points, stamps)
 
     def _found(self, given: _Inputs) -> Estimate | Failure:
-        exposure, counts, points, pixels, scores, prior, expected_share, rotation, modes = given
+        exposure, counts, points, pixels, scores, prior, expected_share, rotation, *of_map = given
         terms, assumed = self._assume(exposure.span)
         if prior is not None or rotation is not None:
             terms, assumed = of_frame(terms, assumed, prior, rotation)
@@ -285,7 +295,7 @@ class Localizer:
             points,
             usable,
             rotation,
-            modes,
+            *of_map,
         )
         # 2. Near the predicted motion, if the points agree with it (tracking).
         if prior is not None and prior.motion is not None:
@@ -398,6 +408,16 @@ class Localizer:
         focal = observed.assumed.focal_length
         return math.hypot(threshold, _MAP_GATE * deviation * focal / max(depth, NEAREST))
 
+    def _parts(
+        self, observed: Observed, posterior: Posterior, look: Callable[[], Look]
+    ) -> list[MovedPart]:
+        """Return the parts of the map that this frame, and those before, show elsewhere."""
+        here = None
+        if left_nearby(observed, posterior):
+            here = moved_part([look()], self.config.map_deviation, sides=False)
+        before = observed.parts.part if observed.parts is not None else None
+        return [part for part in (before, here) if part is not None]
+
     def _own_terms(self, observed: Observed, prior: Prior) -> PriorTerms:
         """Return the prior of a frame from itself and from the velocities of earlier frames.
 
@@ -422,17 +442,20 @@ class Localizer:
         tracked, terms = prior is not None and knows_motion(prior), observed.terms
         if prior is not None and tracked:
             terms = self._own_terms(observed, prior)
-        effect = NO_EFFECT
+        effect, rolling = NO_EFFECT, self._solver.rolling_shutter
+        watched = rolling and observed.exposure.alone
+        look = partial(look_at, observed, posterior, terms)
         enough = np.count_nonzero(posterior.inliers) >= self.config.min_inliers
         if enough and posterior.determined and np.all(np.isfinite(posterior.state)):
             effect = calibration_effect(
-                observed, posterior, terms, self.config.calibration, tracked, observed.error_modes
-            )
+                observed, posterior, terms, self.config.calibration, tracked,
+                self._parts(observed, posterior, look) if watched else (),
+            )  # fmt: skip
         posterior = posterior._replace(
             declared=math.hypot(posterior.declared, effect.residual),  # px, of map and calibration
             speeding=speeding(observed, posterior.state),
         )
-        gate, rolling = self._gate(observed, posterior.state), self._solver.rolling_shutter
+        gate = self._gate(observed, posterior.state)
         failure = refusal(
             posterior, best.samples, min_inliers=self.config.min_inliers, threshold=gate,
             rolling=rolling,
@@ -444,6 +467,8 @@ class Localizer:
             odd = left_out(self._search, observed, posterior, gate, known=tracked)
         if odd.failure is not None:
             return odd.failure
+        if watched and observed.parts is not None:
+            observed.parts.add(look)
         effect = widened(effect, posterior)
         estimate = estimate_of(observed, posterior, best.samples, effect, tracked)
         return replace(estimate, left_out=odd.notice) if odd.notice else estimate

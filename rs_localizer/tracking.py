@@ -39,7 +39,7 @@ from rs_localizer.core.state import (
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.estimation.known_rotation import Aid, Foretold, LastFrame
-from rs_localizer.estimation.moved_part import MovedPart
+from rs_localizer.estimation.moved_part import MovedPart, MovedParts
 from rs_localizer.estimation.prior import Prior, beside, predicted, unchecked
 from rs_localizer.estimation.window import (
     FADING,
@@ -164,7 +164,8 @@ class Tracker:
         rig = localizer.rig
         alone = rig.exposure().ahead() if len(rig.cameras) == 1 else None
         self.lens = LensWatch(alone if self.shutter.watches else None, localizer.config)
-        self._integrity = Integrity(alone, localizer.config.map_deviation)
+        self._integrity = Integrity()
+        self._parts = MovedParts(localizer.config.map_deviation)
         self._last_ns: int | None = None
         self._too_close = 0
         if aid is not None:
@@ -175,6 +176,7 @@ class Tracker:
         """Forget all frames so far."""
         self._track = self._given = None
         self._integrity.reset()
+        self._parts.reset()
         self._seen.clear()
         self._images, self.repeats = RepeatedImages(), False
         self.shutter.reset()
@@ -196,7 +198,7 @@ class Tracker:
     @property
     def moved(self) -> MovedPart | None:
         """The part of the map that frames of a single camera show elsewhere; None: none."""
-        return self._integrity.moved
+        return self._parts.part
 
     def mount(self, rig: Rig) -> None:
         """Set new mounts of the same cameras; the rig's axes stay the same."""
@@ -414,7 +416,15 @@ class Tracker:
 
         def find(prior: Prior | None, rotation: RotationPrior | None = None) -> Estimate | Failure:
             return self.localizer.find(
-                points, pixels, scores, prior, share, rotation, stamps, context.error_modes
+                points,
+                pixels,
+                scores,
+                prior,
+                share,
+                rotation,
+                stamps,
+                context.error_modes,
+                self._parts,
             )
 
         foreseen = None
@@ -436,9 +446,6 @@ class Tracker:
         self._keep(_Seen(time_ns, result, points, pixels, stamps))
         self._images.add(time_ns, points, pixels)
         self._publish()
-        newest = self._seen[-1].found
-        if result and newest and pixels is not None and self.lens.is_beyond(newest):
-            self._integrity.look(newest, np.asarray(points), np.asarray(pixels))
         return self.delayed
 
     def _fitted(

@@ -16,6 +16,7 @@ moves motion and smooth error by ``-H^-1 A^T b``. A smooth error of ``f`` deviat
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +30,7 @@ from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE, TURN, rotation_of
 from rs_localizer.estimation.hypotheses import Posterior
 from rs_localizer.estimation.linear_fit import ORDINARY, known_at, smooth_columns
+from rs_localizer.estimation.moved_part import MovedPart
 from rs_localizer.estimation.points import Observed, rays_of_lens
 from rs_localizer.estimation.prior import SPEEDS, PriorTerms, terms_at
 from rs_localizer.estimation.projection import linearized
@@ -96,7 +98,7 @@ NO_EFFECT = CalibrationEffect(np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)), 
 
 def calibration_effect(
     observed: Observed, posterior: Posterior, terms: PriorTerms, deviation: CalibrationErrors,
-    tracked: bool, of_map: ErrorModes | None = None,
+    tracked: bool, parts: Sequence[MovedPart] = (),
 ) -> CalibrationEffect:  # fmt: skip
     """Return the effect of errors of calibration and map on the motion of a frame.
 
@@ -104,7 +106,7 @@ def calibration_effect(
         terms: what is known of the motion but for poses of other frames, which are off by as much.
         tracked: poses of other frames are known, so that the covariance has no longer all of what
             the smooth error does.
-        of_map: errors of the points; None: they have none.
+        parts: of the map that are elsewhere; what they leave of the points nobody has declared.
     """
     observations, chosen = observed.observations, posterior.inliers
     exposure = observed.exposure
@@ -123,8 +125,13 @@ def calibration_effect(
             columns[here, :, first : first + _ERRORS] = _columns(
                 side.camera, side.towards(rays[here]), deviation
             )
-    if of_map is not None:
-        moved = of_map.at(observed.points[observed.usable.indices[chosen]])
+    declared = columns.shape[2]
+    of_map = observed.error_modes
+    if of_map is not None or parts:
+        places = observed.points[observed.usable.indices[chosen]]
+        each = [] if of_map is None else [of_map.at(places)]
+        moved = np.concatenate([*each, *(part.at(places) for part in parts)], axis=2)
+        declared += moved.shape[2] - 2 * len(parts)
         # A camera that moves as the point does would move it the other way: of a deviation either
         # sign will do.
         by_point = by_motion[:, :, MOVE] @ rotation_of(posterior.state)
@@ -161,7 +168,8 @@ def calibration_effect(
         return NO_EFFECT._replace(still_deviation=still)
     pull, taken = inverses[0, :MOTION_PARAMETERS] @ crossed, inverses[1] @ of_errors
     # What no motion takes up.
-    left = np.trace(every[fitted:, fitted:]) + np.sum(taken * (of_motion @ taken - 2.0 * of_errors))
+    left = np.sum(taken * (of_motion @ taken - 2.0 * of_errors), axis=0)
+    left = (left + np.diagonal(every)[fitted:])[:declared].sum()
     residual = math.sqrt(max(float(left), 0.0) / max(len(rows), 1))
     return CalibrationEffect(pull @ pull.T, residual, still)
 

@@ -37,9 +37,9 @@ from rs_localizer.estimation.robust import (
 )
 from rs_localizer.estimation.search import GLOBAL_SHUTTER_SCALE, MotionSearch
 
-# So many points have a motion, or a pose, whatever they are; the corners of one marker may be
-# misplaced in the map.
-_SAMPLE, _OF_POSE, _MARKER = 6, 3, 4
+# So many points have a motion, a pose, or a shift, whatever they are; the corners of one marker may
+# be misplaced in the map.
+_SAMPLE, _OF_POSE, _OF_SHIFT, _MARKER = 6, 3, 2, 4
 # Explanations that chance makes in one frame of 1,000 (Desolneux, Moisan and Morel, IJCV 2000: the
 # number of false alarms).
 _LEAST_CHANCE = -math.log(1e-3)
@@ -143,6 +143,14 @@ def left_out(
         f"{text}: which of both is the camera's? A part of the map was moved, or the calibration "
         "is grossly wrong",
     ))  # fmt: skip
+
+
+def left_nearby(observed: Observed, posterior: Posterior) -> bool:
+    """Return whether more of the points that are left out lie near their places than by chance."""
+    left = posterior.squared_errors[~posterior.inliers]
+    circle = (GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length) ** 2
+    near, chance = int(np.count_nonzero(left < circle)), math.pi * circle / _area(observed)
+    return _surprise(len(left), near, _OF_SHIFT, chance) > _LEAST_CHANCE
 
 
 def _cameras_apart(observed: Observed, inliers: BoolArray, second: _Group, threshold: float) -> str:

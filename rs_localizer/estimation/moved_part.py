@@ -1,219 +1,321 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The part of a map that lies elsewhere than the map says, from what frames leave of its points.
+"""A part of the map that lies elsewhere than the map says: two groups, each consistent.
 
 Let a part ``P`` of the landmarks be shifted by ``d``. A frame is then off by
 
-    e_i = J_i d [i in P] + B_i m + S_i c + noise
+    e_i = J_i d [i in P] + A_i x + noise
 
-``J`` is the derivative by the landmark's place, ``m`` the error of the frame's motion, and ``c``
-the smooth error of its image: a lens, or a map that is bent. Both are free in every frame and are
-projected out. What is left after that stays with the landmarks only if the map has a step. Shifts
-of all landmarks, each its own, say how much stays; one part with one shift must explain it.
+``J`` is the derivative by the landmark's place. ``x`` is the motion of the frame and the smooth
+error of its image, each with its prior. One shift and one part, of one frame or of some, must
+explain more than chance: the evidence of the split, whose labels cost what they tell, is compared
+with that of one group. Which part is where the map says is not told. Each is by the number of its
+landmarks, because a part is one thing, however many of its landmarks a frame shows.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
-from rs_localizer.core.rig import Exposure
 from rs_localizer.core.shake import shake_at
-from rs_localizer.core.state import MOTION_PARAMETERS, MOVE
-from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.linear_fit import DEGREE
-from rs_localizer.estimation.points import find_usable, packed
-from rs_localizer.estimation.prior import state_in
+from rs_localizer.core.state import MOVE, PARAMETERS, rotation_of
+from rs_localizer.estimation.hypotheses import Posterior
+from rs_localizer.estimation.linear_fit import ORDINARY, known_at, smooth_columns
+from rs_localizer.estimation.points import Observed
+from rs_localizer.estimation.prior import PriorTerms
 from rs_localizer.estimation.projection import linearized
+from rs_localizer.estimation.robust import LEAST_NOISE, TINY, WIDEST_GATE
+from rs_localizer.estimation.search import GLOBAL_SHUTTER_SCALE
 
-# Landmarks that are compared: more take longer than they are worth.
-_MOST = 60
-# Rows of a frame for each column that is projected out: with fewer, hardly anything is left.
-_ROWS_PER_COLUMN = 2
-# Combinations of columns that are shorter than this, of the longest, are none.
-_LEAST_COLUMN = 1e-3
-# The prior of the landmarks' own shifts, as a part of their mean information: none to speak of.
-_RIDGE = 1e-4
-# A landmark's direction must vary by so much (rad, rms): dirt on a lens stays where it is.
-_LEAST_VIEW = 0.01
-# What stays with landmarks over what noise lets stay. Right maps have 0.8 to 1.3, as have all wrong
-# lenses of benchmarks.kinds; half a map that is off by 1 cm has 60 to 200.
-_STAYS = 3.0
-# Share of what stays that one part explains. The best split of normal variates explains 2 / pi of
-# them, a wrong part of a map that has a right one up to 0.87, and the right part more than 0.99.
-_EXPLAINED = 0.9
+# Frames that are compared, and after how many others at most: it takes some 20 ms.
+_LOOKS, _RARELY = 4, 60
+# Splits that chance makes in one search of 1,000.
+_LEAST_CHANCE = -math.log(1e-3)
 # Declared deviations of two landmarks within which they are no two parts.
 _DECLARED = 3.0 * math.sqrt(2.0)
 # Parts from which the search starts, beyond these quantiles along the axes and their diagonals.
-_QUANTILES, _STARTS = (0.2, 0.35, 0.5, 0.65, 0.8), 6
+_QUANTILES, _STARTS = (0.2, 0.35, 0.5, 0.65, 0.8), 3
 _ALONG = np.array([
     (x, y, z) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0) for z in (-1.0, 0.0, 1.0)
 ])[14:]  # fmt: skip
+# So many landmarks have a shift, whatever they are.
+_OF_SHIFT = 2
+# Rounds of labels and fits: they mostly agree after four.
+_ROUNDS = 10
+# Of diagonals of normal equations, so that rounding leaves them positive.
+_RIDGE = 1e-9
 
 
 class Look(NamedTuple):
-    """A frame without what its motion and its smooth error explain."""
+    """What a frame leaves of its landmarks, linearized at its motion."""
 
-    points: Array  # (n,3) m
-    rays: Array  # (n,2)
+    points: Array  # (n,3) m, as the map has them
+    errors: Array  # (n,2) px
     by_place: Array  # (n,2,3) px per m, derivatives of the errors by the places in the map
-    taken: Array  # (n,2,q) orthonormal columns that are projected out
-    left: Array  # (n,2) px, errors without them
+    columns: Array  # (n,2,p) px, by motion and smooth error
+    prior: Array  # (p,p) information on those, times the variance of the noise, if errors are 1 px
+    sizes: tuple[float, float]  # px, of the smooth error: as it was found, and as is declared
+    inliers: BoolArray  # (n,)
+    reach: float  # px, within which a point belongs to a group
+    area: float  # px, of the image, where the others are anywhere
 
 
 class MovedPart(NamedTuple):
-    """Landmarks that lie elsewhere, together."""
+    """Landmarks that lie elsewhere, together, or all others do."""
 
     points: Array  # (m,3) as the map has them
-    way: Array  # (3,) m, from there to where they are
-    compared: int  # landmarks among which they were found
+    others: Array  # (n,3) that were compared with them
+    way: Array  # (3,) m, from there to where they are, seen from the others
+
+    def at(self, points: Array) -> Array:
+        """Return modes (n,3,2) of points (n,3): by how much either group moves if it has moved."""
+        every = np.concatenate([self.points, self.others])
+        far = np.linalg.norm(points[:, None] - every, axis=2)
+        inside = far.argmin(axis=1) < len(self.points)
+        share = len(self.points) / len(every)
+        moves = [math.sqrt(1.0 - share) * inside, -math.sqrt(share) * ~inside]
+        modes: Array = np.stack(moves, axis=1)[:, None, :] * self.way[:, None]
+        return modes
 
 
-def look_at(exposure: Exposure, found: Estimate, points: Array, pixels: Array) -> Look | None:
-    """Return a frame's inliers without what its motion and its image explain; None if too few."""
-    usable = find_usable(exposure, points, pixels, [len(pixels)], None)
-    seen, own = packed(exposure, points, usable), usable.indices
-    state = state_in(found, usable.centre)
-    lines = linearized(seen.packed, len(seen), state, shake_at(usable.tau[own], found.shake))
-    places, by_motion = points[own], lines.by_motion
-    x, y = lines.image.T
-    terms = np.stack(
-        [x**i * y**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)], axis=1
-    )
-    nothing = np.zeros_like(terms)
-    smooth = np.concatenate(
-        [np.stack([terms, nothing], axis=1), np.stack([nothing, terms], axis=1)], axis=2
-    )
-    columns = np.concatenate([by_motion[:, :, :MOTION_PARAMETERS], smooth], axis=2)
-    count, width = len(places), columns.shape[2]
-    if 2 * count < _ROWS_PER_COLUMN * width:
-        return None
-    flat = columns.reshape(2 * count, width)
-    if not (np.isfinite(flat).all() and np.isfinite(lines.errors).all()):
-        return None
-    taken, sizes, _ = np.linalg.svd(
-        flat / np.maximum(np.linalg.norm(flat, axis=0), 1e-12), full_matrices=False
-    )
-    taken = taken[:, sizes > _LEAST_COLUMN * sizes[0]]
-    off = -lines.errors.ravel()
-    off -= taken @ (taken.T @ off)
-    by_place = -by_motion[:, :, MOVE] @ found.rotation
-    return Look(places, lines.image, by_place, taken.reshape(count, 2, -1), off.reshape(count, 2))
-
-
-def moved_part(looks: Sequence[Look], map_deviation: float) -> MovedPart | None:
-    """Return the part of the map that looks show elsewhere; None if they show no such part.
+def look_at(observed: Observed, posterior: Posterior, terms: PriorTerms) -> Look:
+    """Return what a frame leaves of its inliers, and of points near them.
 
     Args:
-        looks: of several frames.
+        terms: what is known of its motion but for poses of other frames.
+    """
+    seen, variance = observed.observations, posterior.noise**2
+    lines = linearized(seen.packed, len(seen), posterior.state, shake_at(seen.tau, posterior.shake))
+    circle = (GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length) ** 2
+    near = np.flatnonzero(np.sum(lines.errors**2, axis=1) < circle)  # NaN is not
+    by_motion, bend = lines.by_motion[near], np.zeros((len(near), 0))
+    if posterior.bend.shape[1]:
+        bend = posterior.bend[near]
+    smooth = smooth_columns(by_motion, lines.image[near], bend)
+    columns = np.concatenate([by_motion[:, :, :PARAMETERS], smooth], axis=2)
+    prior, motion = variance * np.eye(columns.shape[2]), slice(0, PARAMETERS)
+    prior[motion, motion] = variance * known_at(terms, posterior.state).form[motion, motion]
+    sizes = posterior.shared, math.hypot(posterior.declared, ORDINARY)
+    return Look(
+        observed.points[observed.usable.indices[near]],
+        -lines.errors[near],
+        -by_motion[:, :, MOVE] @ rotation_of(posterior.state),
+        columns,
+        prior,
+        sizes,
+        posterior.inliers[near],
+        WIDEST_GATE * posterior.gate,
+        float(math.prod(observed.exposure.cameras[0].size)),
+    )
+
+
+class MovedParts:
+    """Looks, now and then, whether the frames of a track show a part of the map elsewhere.
+
+    Args:
         map_deviation: m, as declared.
     """
-    every = np.concatenate([look.points for look in looks])
-    points, which = np.unique(every, axis=0, return_inverse=True)
-    which = which.ravel()
-    if not _view_moved(looks, which, len(points)):
+
+    def __init__(self, map_deviation: float) -> None:
+        self._map_deviation = map_deviation
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all frames."""
+        self.part: MovedPart | None = None
+        """The part that was last found; None: the frames that were last compared show none."""
+        self._looks: deque[Look] = deque(maxlen=_LOOKS)
+        self._count, self._next = 0, 1
+
+    def add(self, look: Callable[[], Look]) -> None:
+        """Take an accepted frame."""
+        self._count += 1
+        if self._count <= self._next - _LOOKS:
+            return
+        self._looks.append(look())
+        if self._count < self._next:
+            return
+        self.part = moved_part(self._looks, self._map_deviation)
+        self._looks.clear()
+        self._next += min(self._count, _RARELY)
+
+
+class _Shifted(NamedTuple):
+    """The frames, fitted with one part that is shifted."""
+
+    way: Array  # (3,) m
+    costs: Array  # (2,m) px^2 of landmarks that lie where the map has them, or are shifted
+    apart: list[Array]  # (2,n) likewise of the points of each frame
+    squares: float  # px^2
+    freedom: float
+
+
+class _Split(NamedTuple):
+    """Two groups of landmarks."""
+
+    gain: float  # logarithm of their evidence, against one group
+    part: BoolArray  # (m,)
+    found: BoolArray  # (m,) in either group
+    way: Array  # (3,) m
+
+
+class _Frames(NamedTuple):
+    """Frames, and the landmarks that they show."""
+
+    looks: Sequence[Look]
+    which: list[IntArray]  # landmarks (n,) of each frame
+    points: Array  # (m,3) of the landmarks
+
+
+def moved_part(looks: Sequence[Look], map_deviation: float, sides: bool = True) -> MovedPart | None:
+    """Return the part of the map that lies elsewhere than the rest; None if there is none.
+
+    Args:
+        looks: of one frame, or of several.
+        map_deviation: m, as declared.
+        sides: whether also parts are looked for that have no point which is left out.
+    """
+    frames = _frames(looks)
+    points = frames.points
+    kept = [look.inliers for look in looks]
+    nothing = np.zeros(len(points), np.bool_)
+    alone = _fitted(frames, nothing, kept, declared=False)
+    first = _evidence(frames, alone, kept)
+    fitting = nothing.copy()
+    for own, look in zip(frames.which, looks, strict=True):
+        fitting[own[look.inliers]] = True
+    starts = [] if fitting.all() else [~fitting]
+    if sides:
+        starts += _sides(frames, fitting)
+    splits = [split for start in starts if (split := _settled(frames, start))]
+    best = max(splits, key=lambda split: split.gain, default=None)
+    if best is None or best.gain < first + _LEAST_CHANCE:
         return None
-    size = 3 * len(points)
-    flat, towards = np.zeros((size, size)), np.zeros((len(points), 3))
-    information = flat.reshape(len(points), 3, len(points), 3)
-    squared, freedom, first = 0.0, 0, 0
-    for look in looks:
-        own = which[first : first + len(look.points)]
-        first += len(own)
-        rows = np.swapaxes(look.by_place, 1, 2)
-        taken = (rows @ look.taken).reshape(3 * len(own), -1)
-        places = (3 * own[:, None] + np.arange(3)).ravel()
-        flat[np.ix_(places, places)] -= taken @ taken.T
-        information[own, :, own, :] += rows @ look.by_place
-        towards[own] += np.einsum("nra,nr->na", look.by_place, look.left)
-        squared += float(np.sum(look.left**2))
-        freedom += 2 * len(own) - look.taken.shape[2]
-    target = towards.ravel()
-    ridge = _RIDGE * float(np.trace(flat)) / size
-    inverse = np.linalg.inv(flat + ridge * np.eye(size))
-    shifts = inverse @ target
-    stays = float(2.0 * shifts @ target - shifts @ flat @ shifts)
-    fitted = size - ridge * float(np.trace(inverse))
-    variance = (squared - stays) / max(freedom - fitted, 1.0)
-    if freedom <= fitted or stays < _STAYS * fitted * variance:
+    if float(np.linalg.norm(best.way)) <= _DECLARED * map_deviation:
         return None
-    gain, part, way = max(
-        (_grown(information, towards, start) for start in _starts(information, towards, points)),
-        key=lambda found: found[0],
+    part, rest, way = best.part & best.found, ~best.part & best.found, best.way
+    if np.count_nonzero(part) > np.count_nonzero(rest):
+        part, rest, way = rest, part, -way
+    return MovedPart(points[part], points[rest], way)
+
+
+def _frames(looks: Sequence[Look]) -> _Frames:
+    """Number the landmarks of frames."""
+    if len(looks) == 1:
+        return _Frames(looks, [np.arange(len(looks[0].points))], looks[0].points)
+    points, which = np.unique(
+        np.concatenate([look.points for look in looks]), axis=0, return_inverse=True
     )
-    if gain < _EXPLAINED * (stays - fitted * variance):
+    ends = np.cumsum([len(look.points) for look in looks])[:-1]
+    return _Frames(looks, np.split(which.ravel(), ends), points)
+
+
+def _fitted(
+    frames: _Frames, part: BoolArray, kept: Sequence[BoolArray], declared: bool = True
+) -> _Shifted:
+    """Fit motions, smooth errors and the shift of a part to the points that are kept.
+
+    ``declared``: smooth errors are as large as is declared, and not as without a part.
+    """
+    information, target, squares, freedom = np.zeros((3, 3)), np.zeros(3), 0.0, 0.0
+    solved = []
+    for look, own, these in zip(frames.looks, frames.which, kept, strict=True):
+        flat, inverse, taken = _beside(look, these, declared)
+        shifted = (look.by_place * part[own][:, None, None])[these].reshape(len(flat), 3)
+        errors = look.errors[these].ravel()
+        by_shift, along = flat.T @ shifted, flat.T @ errors
+        beside, back = inverse @ by_shift, inverse @ along
+        information += shifted.T @ shifted - by_shift.T @ beside
+        target += shifted.T @ errors - by_shift.T @ back
+        squares += float(errors @ errors - along @ back)
+        freedom += len(errors) - taken
+        solved.append((beside, back))
+    information += max(_RIDGE * float(np.trace(information)), TINY) * np.eye(3)
+    way: Array = np.linalg.solve(information, target)
+    costs, apart = np.zeros((2, len(part))), []
+    for look, own, (beside, back) in zip(frames.looks, frames.which, solved, strict=True):
+        left = look.errors - look.columns @ (back - beside @ way)
+        each = np.stack([
+            np.sum(left**2, axis=1), np.sum((left - look.by_place @ way) ** 2, axis=1)
+        ])  # fmt: skip
+        np.add.at(costs.T, own, each.T)
+        apart.append(each)
+    return _Shifted(way, costs, apart, squares - float(target @ way), freedom)
+
+
+def _beside(look: Look, kept: BoolArray, declared: bool = True) -> tuple[Array, Array, float]:
+    """Return columns (2n,p) of motion and smooth error, their covariance, and what they take up."""
+    flat = look.columns[kept].reshape(-1, len(look.prior))
+    normal, prior = flat.T @ flat, look.prior.copy()
+    smooth = np.arange(PARAMETERS, len(prior))
+    prior[smooth, smooth] /= max(look.sizes[declared], LEAST_NOISE) ** 2
+    weight = normal + prior
+    weight[np.diag_indices(len(weight))] *= 1.0 + _RIDGE
+    inverse = np.linalg.inv(weight)
+    return flat, inverse, float(np.sum(inverse * normal))
+
+
+def _evidence(frames: _Frames, fit: _Shifted, kept: Sequence[BoolArray]) -> float:
+    """Return the log evidence of the points that are kept, the others anywhere in an image."""
+    variance = max(fit.squares / max(fit.freedom, 1.0), LEAST_NOISE**2)
+    each, total = math.log(2.0 * math.pi * variance) + 1.0, 0.0
+    for look, these in zip(frames.looks, kept, strict=True):
+        inside = np.count_nonzero(these)
+        total -= inside * each + (len(these) - inside) * math.log(look.area)
+    return total
+
+
+def _settled(frames: _Frames, part: BoolArray) -> _Split | None:
+    """Let each landmark join the group that it fits, until none changes; None if one vanishes."""
+    kept = [np.ones(len(look.points), np.bool_) for look in frames.looks]
+    for _ in range(_ROUNDS):
+        fit = _fitted(frames, part, kept)
+        before, part = part, fit.costs[1] < fit.costs[0]
+        near = [
+            np.where(part[own], *each[::-1]) < look.reach**2
+            for look, own, each in zip(frames.looks, frames.which, fit.apart, strict=True)
+        ]
+        settled = np.array_equal(part, before) and all(map(np.array_equal, near, kept))
+        kept = near
+        if settled or np.count_nonzero(part) <= _OF_SHIFT:
+            break
+    found = np.zeros(len(part), np.bool_)
+    for own, these in zip(frames.which, kept, strict=True):
+        found[own[these]] = True
+    count, size = int(np.count_nonzero(found)), int(np.count_nonzero(part & found))
+    if not _OF_SHIFT < size < count:
         return None
-    if float(np.linalg.norm(way)) <= _DECLARED * map_deviation:
-        return None
-    if 2 * np.count_nonzero(part) > len(points):  # which of two parts has moved is not told
-        part, way = ~part, -way
-    return MovedPart(points[part], way, len(points))
+    fit = _fitted(frames, part, kept)
+    rows = 2.0 * sum(np.count_nonzero(these) for these in kept)
+    labels = math.lgamma(count + 1) - math.lgamma(size + 1) - math.lgamma(count - size + 1)
+    gain = _evidence(frames, fit, kept) - labels - math.log(count) - 1.5 * math.log(rows)
+    return _Split(gain, part, found, fit.way)
 
 
-def _view_moved(looks: Sequence[Look], which: IntArray, count: int) -> bool:
-    """Return whether landmarks were seen in several directions, so that a lens errs otherwise."""
-    rays, seen = np.concatenate([look.rays for look in looks]), np.bincount(which, minlength=count)
-    squares = np.zeros(count)
-    for axis in rays.T:
-        mean = np.bincount(which, axis, count) / seen
-        squares += np.bincount(which, (axis - mean[which]) ** 2, count) / seen
-    return math.sqrt(float(np.median(squares))) >= _LEAST_VIEW
-
-
-def _shift(information: Array, towards: Array, part: BoolArray) -> tuple[float, Array]:
-    """Return what one shift of a part explains, and the shift (3,)."""
-    one = part.astype(np.float64)
-    inside = np.tensordot(one, np.tensordot(information, one, (2, 0)), (0, 0))
-    target = towards[part].sum(axis=0)
-    way: Array = np.linalg.lstsq(inside, target, rcond=None)[0]
-    return float(target @ way), way
-
-
-def _starts(information: Array, towards: Array, points: Array) -> list[BoolArray]:
-    """Return the sides of planes through the map that explain most."""
-    away = points - points.mean(axis=0)
-    values, axes = np.linalg.eigh(away.T @ away)
-    places = away @ axes / np.sqrt(np.maximum(values, _RIDGE * values[-1]))
-    sides = [
-        place > edge for place in (places @ _ALONG.T).T for edge in np.quantile(place, _QUANTILES)
-    ]
-    sides = [side for side in sides if side.any() and not side.all()]
-    sides.sort(key=lambda side: -_shift(information, towards, side)[0])
-    return sides[:_STARTS]
-
-
-def _grown(information: Array, towards: Array, part: BoolArray) -> tuple[float, BoolArray, Array]:
-    """Return the gain of a part, the part and its way, once no landmark is better elsewhere."""
-    gain, way = _shift(information, towards, part)
-    while True:
-        target = towards @ way
-        products = np.tensordot(np.tensordot(information, way, (3, 0)), way, (1, 0))
-        inside = part.astype(np.float64)
-        for _ in range(2 * len(part)):
-            better = 2.0 * (target - products @ inside) * (1.0 - 2.0 * inside)
-            better -= np.diag(products)
-            best = int(np.argmax(better))
-            if better[best] <= 0.0:
-                break
-            inside[best] = 1.0 - inside[best]
-        other = inside > 0.5
-        if not other.any() or other.all():
-            return gain, part, way
-        more, other_way = _shift(information, towards, other)
-        if more <= gain * (1.0 + _RIDGE):
-            return gain, part, way
-        gain, part, way = more, other, other_way
-
-
-def chosen(points: Array, inliers: BoolArray, before: Sequence[Look]) -> IntArray:
-    """Return the indices of inliers to look at: those seen before, and others up to the most."""
-    rows = np.flatnonzero(inliers)
-    known = {tuple(point) for look in before for point in look.points.tolist()}
-    again = np.array([tuple(point) in known for point in points[rows].tolist()], np.bool_)
-    new = rows[~again]
-    few = max(min(len(new), _MOST - len(known)), 0)
-    return np.sort(np.r_[rows[again], new[np.linspace(0, len(new) - 1, few).astype(int)]])
+def _sides(frames: _Frames, fitting: BoolArray) -> list[BoolArray]:
+    """Return the sides of planes through the map whose shifts explain most."""
+    away = frames.points - frames.points[fitting].mean(axis=0)
+    values, axes = np.linalg.eigh(away[fitting].T @ away[fitting])
+    places = away @ axes / np.sqrt(np.maximum(values, 1e-4 * values[-1])) @ _ALONG.T
+    edges = np.quantile(places[fitting], _QUANTILES, axis=0)
+    sides = np.concatenate([(places > edge).T for edge in edges]).astype(np.float64)
+    information, targets = np.zeros((len(sides), 3, 3)), np.zeros((len(sides), 3))
+    for look, own in zip(frames.looks, frames.which, strict=True):
+        these = look.inliers
+        flat, inverse, _ = _beside(look, these)
+        by_place, errors, of = look.by_place[these], look.errors[these], sides[:, own[these]]
+        count, rows = len(by_place), np.swapaxes(by_place, 1, 2)
+        by_shift = (of @ (rows @ look.columns[these]).reshape(count, -1)).reshape(len(of), 3, -1)
+        information += (of @ (rows @ by_place).reshape(count, 9)).reshape(-1, 3, 3)
+        information -= by_shift @ inverse @ np.swapaxes(by_shift, 1, 2)
+        targets += of @ np.einsum("nra,nr->na", by_place, errors)
+        targets -= by_shift @ (inverse @ (flat.T @ errors.ravel()))
+    information += max(_RIDGE * float(information[0].trace()), TINY) * np.eye(3)
+    gains = np.einsum("sa,sa->s", targets, np.linalg.solve(information, targets[..., None])[..., 0])
+    return [sides[k] > 0.5 for k in np.argsort(-gains)[:_STARTS]]

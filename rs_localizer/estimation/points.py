@@ -41,6 +41,7 @@ from rs_localizer.native import entry, kernel
 
 if TYPE_CHECKING:
     from rs_localizer.estimation.calibration import ErrorModes
+    from rs_localizer.estimation.moved_part import MovedParts
 
 
 @entry
@@ -270,6 +271,7 @@ class Observed:
     usable: Usable  # what of these can be used
     rotation: RotationPrior | None  # what the rays are compensated by
     error_modes: ErrorModes | None = None  # of the map
+    parts: MovedParts | None = None  # of the map, that lie elsewhere
 
     @property
     def centre(self) -> Array:
