@@ -318,9 +318,10 @@ class GyroscopeTrack:
         far = float(step[_SEEN] @ np.linalg.solve(expected, step[_SEEN])) / _MOST_DISTANCE
         if found.aided:
             far = max(far, _swung(found, prediction.rotation) / _MOST_SWING)
-        # A prediction that is too far off counts as much as one at the limit.
-        part = _Foreseen(foreseen.motion, spread, foreseen.tied[motions])
-        self._learn(part, information / max(far, 1.0), pull / max(far, 1.0))
+        if far > 1.0:  # a prediction that is too far off counts as much as one at the limit
+            information, pull = information / far, pull / far
+            gain = np.linalg.inv(np.eye(PARAMETERS) + spread @ information)
+        self._learn(foreseen.tied[motions], gain, information, pull)
         agrees = bool(far <= 1.0)
         self._contradictions.append(not agrees)
         self._age += 1
@@ -335,9 +336,7 @@ class GyroscopeTrack:
         self._unused = None if agrees and not often else Unused(reason, self._oddity())
         return self._unused is None
 
-    def _learn(self, foreseen: _Foreseen, information: Array, pull: Array) -> None:
-        spread, tied = foreseen.covariance, foreseen.tied
-        gain = np.linalg.inv(np.eye(PARAMETERS) + spread @ information)
+    def _learn(self, tied: Array, gain: Array, information: Array, pull: Array) -> None:
         mean = self.errors.mean + tied.T @ gain.T @ pull
         covariance = self.errors.covariance - tied.T @ information @ gain @ tied
         covariance = 0.5 * (covariance + covariance.T)
@@ -409,14 +408,8 @@ def _swung(found: Estimate, rotation: RotationPrior) -> float:
     return float(seen @ np.linalg.solve(covariance, seen))
 
 
-def _swings() -> Array:
-    """Return derivatives (12,54) of turns at the row times by an in-frame turn."""
-    values = shake_functions(np.array(_ROWS))[0] @ COMBINATIONS
-    swings: Array = np.asarray(np.kron(values, np.eye(3)), np.float64)
-    return swings
-
-
-_SWINGS = _swings()
+# Derivatives (12,54) of turns at the row times by an in-frame turn.
+_SWINGS: Array = np.kron(shake_functions(np.array(_ROWS))[0] @ COMBINATIONS, np.eye(3))
 
 
 def _is_positive(joint: Array) -> bool:

@@ -13,16 +13,13 @@ from benchmarks.independent.cameras import Camera
 from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.motions import hand, rest, shaken_hand
 from benchmarks.independent.scenes import Rich
-from rs_localizer.core.shutter import Motion
-from rs_localizer.inertial.gyro_prior import GyroscopeTrack, _Foreseen
+from rs_localizer.inertial.gyro_prior import GyroscopeTrack
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.status import InertialSettings
 from rs_localizer.inertial.turning import GyroscopeErrors
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.pose_at_time import twist_at
 from rs_localizer.tracking import Tracker
-
-STILL = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
 
 
 def test_the_update_is_that_of_the_whole_filter():
@@ -37,8 +34,9 @@ def test_the_update_is_that_of_the_whole_filter():
 
     gyroscope = GyroscopeTrack(InertialSettings(1e-4, 1e-4), 0.02)
     gyroscope.errors = GyroscopeErrors(np.zeros(10), joint[18:, 18:], 1e-4)
-    foreseen = _Foreseen(STILL, joint[:18, :18], joint[:18, 18:])
-    gyroscope._learn(foreseen, observed.T @ observed / noise, observed.T @ innovation / noise)
+    information = observed.T @ observed / noise
+    by_prior = np.linalg.inv(np.eye(18) + joint[:18, :18] @ information)
+    gyroscope._learn(joint[:18, 18:], by_prior, information, observed.T @ innovation / noise)
     np.testing.assert_allclose(gyroscope.errors.mean, gain[18:] @ innovation, atol=1e-10)
     np.testing.assert_allclose(gyroscope.errors.covariance, after[18:, 18:], atol=1e-10)
     np.testing.assert_allclose(gyroscope._tied, after[:18, 18:], atol=1e-10)
