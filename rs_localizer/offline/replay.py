@@ -201,7 +201,8 @@ def camera_topics(
         if prefix and topics:
             there[prefix.rpartition("/")[2]] = {CAMERA_INFO: info, **dict(topics[:1])}
     names = list(there) if cameras is None else list(cameras)
-    if missing := [name for name in names if name not in there] or (len(names) < 2 and ["another"]):
+    alone = cameras is None and len(names) < 2
+    if missing := [name for name in names if name not in there] or (alone and ["another"]):
         raise BagError(
             f"{bag.path} has no camera_info beside correspondences, keypoints or images of "
             f"{', '.join(missing)}; it has those of {', '.join(there) or 'no camera'}"

@@ -14,7 +14,7 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.core.reasons import Reason
 from rs_localizer.io.bags import BagError, BagReader
 from rs_localizer.io.topics import GIVEN_POSES
-from rs_localizer.offline.replay import NO_FRAMES, find_topics
+from rs_localizer.offline.replay import NO_FRAMES, camera_topics, find_rig_topics, find_topics
 from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.inputs import INPUTS, Role
 from rs_localizer.pipeline.refusal import Refusal
@@ -81,6 +81,19 @@ def test_what_is_not_there_or_not_clear_is_said():
         find_topics(bag(camera_info=INFO, a=CLOUD), {"correspondences": "/camera_info"})
     with pytest.raises(BagError, match="choose one with -r correspondences:=TOPIC"):
         find_topics(bag(camera_info=INFO, a=CLOUD, b=CLOUD))
+
+
+def test_cameras_of_a_rig_send_one_kind_of_frames():
+    there = {"a/front/camera_info": INFO, "a/front/keypoints": CLOUD, "map_points": CLOUD}
+    pair = {**there, "rear/camera_info": INFO, "rear/correspondences": CLOUD}
+    alone = {"front/camera_info": "/a/front/camera_info", "front/keypoints": "/a/front/keypoints"}
+    assert find_rig_topics(bag(**there), ["front"]).of == alone | {"map_points": "/map_points"}
+    with pytest.raises(BagError, match="all cameras need correspondences, or all keypoints"):
+        find_rig_topics(bag(**pair), ["front", "rear"])
+    with pytest.raises(BagError, match="images of left; it has those of front, rear"):
+        find_rig_topics(bag(**pair), ["front", "left"])
+    with pytest.raises(BagError, match="keypoints or images of another"):
+        camera_topics(bag(**there))
 
 
 PACKAGE = Path(rs_localizer.__file__).parent
