@@ -20,8 +20,10 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
 import rclpy
+from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
 
 # Nobody else's nodes, neither on this machine nor in its network.
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -135,6 +137,13 @@ class Peer:
         future = self._clients[name].call_async(request)
         assert self.spin_until(future.done), f"no answer from {name}"
         return future.result()
+
+    def set(self, node: str, name: str, value: object) -> tuple[bool, str]:
+        """Set a parameter of a node: whether it was, and the reason if not."""
+        parameter = Parameter(name, value=value).to_parameter_msg()
+        request = SetParameters.Request(parameters=[parameter])
+        (result,) = self.call(SetParameters, f"{node}/set_parameters", request).results
+        return result.successful, result.reason
 
     def close(self) -> None:
         self._executor.shutdown()

@@ -5,8 +5,6 @@
 from collections.abc import Callable
 from typing import Any
 
-from rcl_interfaces.srv import SetParametersAtomically
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import CompressedImage, Image
 
 TOPICS = {Image: "/image", CompressedImage: "/image/compressed"}
@@ -49,12 +47,9 @@ class Talk:
         return answers()[0]
 
     def set(self, name: str, value: object) -> tuple[bool, str]:
-        """Set a parameter: whether it was, and the reason if not."""
-        parameter = Parameter(name, value=value).to_parameter_msg()
-        request = SetParametersAtomically.Request(parameters=[parameter])
-        service = f"/{self._node}/set_parameters_atomically"
-        result = self.peer.call(SetParametersAtomically, service, request).result
-        return result.successful, result.reason
+        """Set a parameter of the node."""
+        answer: tuple[bool, str] = self.peer.set(f"/{self._node}", name, value)
+        return answer
 
     def reported(self, wanted: dict[str, str | None]) -> bool:
         """Whether the diagnostics have had these values at once; None: any but 0."""

@@ -14,8 +14,6 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.srv import SetParameters
-from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, Imu, PointCloud2
 
@@ -180,8 +178,6 @@ class Robot:
         return serialized(received, TYPES[name])
 
     def set(self, name: str, value: object) -> tuple[bool, str]:
-        """Set a parameter: whether it was, and the reason if not."""
-        parameter = Parameter(name, value=value).to_parameter_msg()
-        request = SetParameters.Request(parameters=[parameter])
-        result = self.peer.call(SetParameters, f"{self._node}/set_parameters", request).results[0]
-        return result.successful, result.reason
+        """Set a parameter of the node."""
+        answer: tuple[bool, str] = self.peer.set(self._node, name, value)
+        return answer
