@@ -23,14 +23,12 @@ def test_every_public_name_is_there():
 
 
 def test_type_checkers_see_the_same_names():
-    tree = ast.parse(Path(rsl.__file__).read_text())
-    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
-    seen = {
-        alias.name: node.module
-        for node in imports
-        if node.module and node.module.startswith("rs_localizer")
-        for alias in node.names
-    }
+    nodes = ast.walk(ast.parse(Path(rsl.__file__).read_text()))
+    imports = [
+        node for node in nodes
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("rs_localizer")
+    ]  # fmt: skip
+    seen = {alias.name: node.module for node in imports for alias in node.names}
     assert sorted(seen) == rsl.__all__
     homes = {name: module for module, names in rsl._HOMES.items() for name in names}
     assert {name: f"rs_localizer.{module}" for name, module in homes.items()} == seen
