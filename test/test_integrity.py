@@ -64,16 +64,12 @@ def test_doubt_falls_again():
     assert judge.add(judge.numbers(estimate(anywhere()), POINTS, None)) < 0.1
 
 
-def predicted(x: float) -> Prior:
-    """A prediction that has the camera so many m to the side, known to a centimetre."""
-    motion = Motion(np.eye(3), np.array([x, 0.0, 0.0]), np.zeros(3), np.zeros(3))
-    return Prior(motion=motion, covariance=1e-4 * np.eye(12))
-
-
 def test_a_pose_that_jumps_is_doubted_until_it_jumps_back():
     judge, doubts = Integrity(), []
     for i in range(40):
-        prior = predicted(0.5 if i in (10, 30) else 0.005)
+        aside = np.array([0.5 if i in (10, 30) else 0.005, 0.0, 0.0])  # m, known to a centimetre
+        motion = Motion(np.eye(3), aside, np.zeros(3), np.zeros(3))
+        prior = Prior(motion=motion, covariance=1e-4 * np.eye(12))
         doubts.append(judge.add(judge.numbers(estimate(anywhere(), i > 0), POINTS, prior)))
     assert max(doubts[:10]) < 0.05
     assert min(doubts[10:30]) > 0.5  # a map that is wrong everywhere alike shows nothing else
@@ -127,12 +123,8 @@ def test_a_right_scene_in_the_middle_of_the_image_is_not_doubted(monkeypatch):
         width=WIDTH, height=HEIGHT, K=K, D=np.zeros(5), distortion_model="plumb_bob",
         readout_time=READOUT, scan_direction="top_to_bottom",
     )  # fmt: skip
-    tracker, moving, points = (
-        rsl.Tracker(rsl.Localizer(camera)),
-        Moving((0.1, -0.2, 0.0)),
-        scene(150),
-    )
-    doubts = []
+    tracker, doubts = rsl.Tracker(rsl.Localizer(camera)), []
+    moving, points = Moving((0.1, -0.2, 0.0)), scene(150)
     for k in range(300):
         found, seen = matches(moving, points, k / 30.0, seed=k)
         doubts.append(tracker.localize(10**9 + k * 33_333_333, found, seen).integrity)

@@ -209,16 +209,12 @@ def functions(tree: ast.AST) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]
         yield from functions(node)
 
 
-def parameters(function: ast.FunctionDef | ast.AsyncFunctionDef) -> list[str]:
+def takes_many(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
     given = function.args
     named = [item.arg for item in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
     more = [item.arg for item in (given.vararg, given.kwarg) if item is not None]
-    return [name for name in named + more if name not in ("self", "cls")]
-
-
-def is_compiled(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
-    names = {ast.unparse(item).partition("(")[0] for item in function.decorator_list}
-    return bool(names & COMPILED)
+    decorators = {ast.unparse(item).partition("(")[0] for item in function.decorator_list}
+    return len({*named, *more} - {"self", "cls"}) > MOST and not decorators & COMPILED
 
 
 def test_no_function_takes_many_parameters():
@@ -226,7 +222,7 @@ def test_no_function_takes_many_parameters():
         f"{path.relative_to(PACKAGE)}: {function.name}"
         for path in PACKAGE.rglob("*.py")
         for function in functions(ast.parse(path.read_text()))
-        if len(parameters(function)) > MOST and not is_compiled(function)
+        if takes_many(function)
     }
     assert found == INSTEAD_OF_KERNELS | BY_KEYWORDS
 

@@ -23,7 +23,7 @@ from rs_localizer.solvers.table import find_solver
 CAMERA = rsl.Camera(1000, 1000, np.array([[1207, 0, 499.5], [0, 1207, 499.5], [0, 0, 1.0]]))
 
 
-def plane_frame(seed, tilt, turn, travel, size, count=50):
+def plane_frame(seed, tilt, turn, travel, size):
     """A plane 2 to 3 m away, tilted (deg) about a random axis, seen by a moving camera."""
     rng = np.random.default_rng(seed)
 
@@ -33,14 +33,14 @@ def plane_frame(seed, tilt, turn, travel, size, count=50):
 
     angle = rng.uniform(0, 2 * np.pi)
     tilted = Rotation.from_rotvec(np.radians(tilt) * np.array([np.cos(angle), np.sin(angle), 0.0]))
-    flat = np.column_stack([rng.uniform(-size, size, (6 * count, 2)), np.zeros(6 * count)])
+    flat = np.column_stack([rng.uniform(-size, size, (300, 2)), np.zeros(300)])
     in_camera = tilted.apply(flat) + np.array([0.0, 0.0, rng.uniform(2.0, 3.0)])
     rotation, translation = Rotation.random(random_state=seed).as_matrix(), rng.normal(size=3)
     points = (in_camera - translation) @ rotation
     motion = rsl.Motion(rotation, translation, direction(np.radians(turn)), direction(travel))
     pixels, _ = project_rolling(CAMERA, motion.at_rows, points)
     pixels = pixels + rng.normal(size=pixels.shape)
-    seen = np.flatnonzero(CAMERA.inside(pixels))[:count]
+    seen = np.flatnonzero(CAMERA.inside(pixels))[:50]
     return points[seen], pixels[seen], motion
 
 

@@ -5,6 +5,7 @@
 import copy
 import pickle
 from dataclasses import fields, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -70,10 +71,6 @@ def frames(mounted, make, count, points=40, noise=0.0, scene=Scene.RICH, seed=0,
 
 def fast(count, rng):
     return steady(count, rng, 1.5, 0.8)
-
-
-def faster(count, rng):
-    return steady(count, rng, 3.0, 2.0)
 
 
 def stamps_of(mounted):
@@ -183,6 +180,7 @@ def test_opposed_shutters_know_the_motion_before_a_wall():
     off = {}
     for name, rotation in (("opposed", TURNED), ("alike", UPRIGHT)):
         mounted = pair(rotation)
+        faster = partial(steady, rate=3.0, speed=2.0)
         made, motions = frames(mounted, faster, 12, 76, 1.0, Scene.WALL, seed=3)
         localizer = rsl.Localizer(rig_of(mounted))
         results = [localizer.localize(parts) for parts in made]

@@ -29,16 +29,17 @@ class Shaken:
         )
         return self.start * local, np.array([0.1, 0.2, -3.0]) + self.velocity * time
 
-    def rate(self, time, step=1e-6):
+    def rate(self, time):
         """Body rate (3,) rad/s by differences."""
+        step = 1e-6
         before, after = self.pose(time - step)[0], self.pose(time + step)[0]
         return (before.inv() * after).as_rotvec() / (2.0 * step)
 
-    def samples(self, rate=4000.0, reach=0.06, bias=(0.0, 0.0, 0.0), offset=0.0):
+    def samples(self, rate=4000.0, reach=0.06):
         """A noise-free gyroscope about the middle row."""
         times = np.arange(-round(reach * rate), round(reach * rate) + 1) / rate
-        rates = np.array([self.rate(time) for time in times]) + np.asarray(bias)
-        return ImuSamples(MIDDLE_NS + np.rint(1e9 * (times - offset)).astype(np.int64), rates)
+        rates = np.array([self.rate(time) for time in times])
+        return ImuSamples(MIDDLE_NS + np.rint(1e9 * times).astype(np.int64), rates)
 
     def frame(self, camera, count=60, seed=0):
         """Points (n,3) and raw pixels (n,2), each exposed with its own row."""

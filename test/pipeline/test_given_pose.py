@@ -27,14 +27,14 @@ MOUNT = Transform(
 
 def given(
     stamp_ns: int = 5 * SECOND, frame: str = "map", body: str = "",
-    variances: Any = (0.25, 0.25, 0, 0, 0, 0.0685), quaternion: Any = None,
+    variances: Any = (0.25, 0.25, 0, 0, 0, 0.0685),
 ) -> Any:  # fmt: skip
     """As RViz sends it: a robot at (2, 3), turned to the left."""
     rotation = Rotation.from_euler("z", 90, degrees=True).as_matrix()
     pose = make_message(
         "geometry_msgs/msg/Pose",
         position=make_vector(make_message, np.array([2.0, 3.0, 0.0]), "Point"),
-        orientation=quaternion or make_quaternion(make_message, rotation),
+        orientation=make_quaternion(make_message, rotation),
     )
     own = {"pose": pose, "covariance": np.diag(variances).astype(float).ravel()}
     message: Any = {

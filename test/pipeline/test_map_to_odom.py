@@ -21,8 +21,8 @@ SPREAD = (0.01, 0.005)  # m, rad, of each axis of a pose
 CLICK = np.diag([0.25, 0.25, 0.01, 0.0025, 0.0025, 0.0685])
 
 
-def place(x: float, y: float, yaw: float, z: float = 0.0) -> Transform:
-    return Transform(Rotation.from_euler("z", yaw).as_matrix(), np.array([x, y, z]))
+def place(x: float, y: float, yaw: float) -> Transform:
+    return Transform(Rotation.from_euler("z", yaw).as_matrix(), np.array([x, y, 0.0]))
 
 
 class Drive:

@@ -69,10 +69,10 @@ class World:
             self.statistics.answered(frame(self.now - latency), self.now - latency)
             self.now += 1.0 / rate - latency
 
-    def refuse(self, count: int, reason: str = "too_few_inliers") -> None:
+    def refuse(self, count: int) -> None:
         for _ in range(count):
             self.receive()
-            self.statistics.refused(Refusal(reason, "7 of 100"))
+            self.statistics.refused(Refusal("too_few_inliers", "7 of 100"))
             self.now += 0.01
 
     def diagnose(self, condition: Condition = GOOD) -> Any:
