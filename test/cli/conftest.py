@@ -5,7 +5,7 @@
 import contextlib
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,18 @@ def _hear(event: str, given: tuple[Any, ...]) -> None:
 
 
 sys.addaudithook(_hear)  # for good: Python removes none
+
+
+@pytest.fixture
+def ran(capsys) -> Callable[..., Any]:
+    """Runs a command line and returns what it has printed; its exit code is as expected."""
+
+    def ran(*words: object, code: int = 0) -> Any:
+        capsys.readouterr()
+        assert commands.main([*map(str, words)]) == code
+        return capsys.readouterr()
+
+    return ran
 
 
 @pytest.fixture(autouse=True)

@@ -29,15 +29,14 @@ def flight(tmp_path_factory) -> Path:
     return out
 
 
-def test_the_webcam(tmp_path, capsys):
+def test_the_webcam(tmp_path, ran):
     """Its images have no times of their own: the readout time is refused, the lens is written."""
     half, out = tmp_path / "half", tmp_path / "webcam.yaml"
     with open_bag(data.path(data.WEBCAM)) as bag, BagWriter(half) as copy:
         for topic, stamp_ns, message in itertools.islice(bag.messages(tuple(bag.topics)), 180):
             copy.write(topic, message, stamp_ns)
     words = ["calibrate", str(half), "--out", str(out), "--intrinsics"]
-    assert main([*words, "--camera-info", str(tmp_path / "lens.yaml")]) == 1
-    said = capsys.readouterr()
+    said = ran(*words, "--camera-info", tmp_path / "lens.yaml", code=1)
     assert "off their stamps" in said.err
     assert "not written: readout time and scan direction" in said.err
     values = load_params_file(out)
@@ -47,12 +46,11 @@ def test_the_webcam(tmp_path, capsys):
     np.testing.assert_allclose(read_calibration(tmp_path / "lens.yaml").D, camera.D)
 
 
-def test_a_simulated_flight_against_the_assumed_direction(flight, tmp_path, capsys):
+def test_a_simulated_flight_against_the_assumed_direction(flight, tmp_path, ran):
     """Parts have the sense of the direction that is told: positive."""
     out = tmp_path / "camera.yaml"
     words = ["-p", "scan_direction:=bottom_to_top", "-p", "stamp_offset:=0.001", "--out", str(out)]
-    assert main(["calibrate", str(flight), *words]) == 0
-    parts = re.findall(r" to +[\d.]+ s +([-+][\d.]+) \+- ", capsys.readouterr().out)
+    parts = re.findall(r" to +[\d.]+ s +([-+][\d.]+) \+- ", ran("calibrate", flight, *words).out)
     assert parts
     assert all(10.0 < float(part) < 30.0 for part in parts), parts
     values = load_params_file(out)
@@ -86,7 +84,7 @@ def test_an_imu(flight, tmp_path, capsys):
     assert "has no topic of type sensor_msgs/msg/Imu" in capsys.readouterr().err
 
 
-def test_faults(flight, tmp_path, capsys):
+def test_faults(flight, tmp_path, ran):
     video = tmp_path / "video.mjpeg"
     video.write_bytes(2 * cv2.imencode(".jpg", np.zeros((48, 64), np.uint8))[1].tobytes())
     board = ["--board", "5x4", "--square", "0.1"]
@@ -104,9 +102,7 @@ def test_faults(flight, tmp_path, capsys):
         (["--out", str(earlier / "a.yaml")], "a.yaml cannot be written: Not a directory"),
         (["--out", str(tmp_path / "other.yaml"), "--camera-info", str(lens)], f"{lens} exists"),
     ):
-        capsys.readouterr()
-        assert main(["calibrate", str(flight), *words]) == 1
-        told = capsys.readouterr()  # before the work
+        told = ran("calibrate", flight, *words, code=1)  # before the work
         assert text in told.err
         assert told.out == ""
     assert earlier.read_text() == "mine"
@@ -125,11 +121,10 @@ def test_what_a_lens_is_off_by_stays_with_it(flight, tmp_path):
     assert off[0] == off[1]
 
 
-def test_smooth(flight, tmp_path, capsys):
+def test_smooth(flight, tmp_path, ran):
     out, words = tmp_path / "out", ["replay", str(flight), "--smooth", "--out"]
     params = ["--params", str(flight / "parameters.yaml")]
     assert main([*words, str(out), *params, "--pose-rate", "200"]) == 0
     assert np.diff(read_tum(out / "poses.txt").stamps_ns).min() == pytest.approx(5e6, abs=2)
     assert (out / "bridged.txt").read_text() == ""
-    assert main([*words, str(tmp_path / "none")]) == 1
-    assert "--smooth needs the readout time" in capsys.readouterr().err
+    assert "--smooth needs the readout time" in ran(*words, tmp_path / "none", code=1).err

@@ -49,10 +49,9 @@ def pair(rig, tmp_path_factory):
     return recorded(tmp_path_factory.mktemp("pair"), rig, *MOVING)
 
 
-def test_a_pair(pair, tmp_path, capsys):
+def test_a_pair(pair, tmp_path, ran):
     words = ["--out", str(tmp_path / "rig.yaml"), "-p", "calibration.distortion:=0.75"]
-    assert main(["calibrate", "--rig", pair, *words]) == 0
-    said = capsys.readouterr().out
+    said = ran("calibrate", "--rig", pair, *words).out
     assert "rear <- front " in said
     values = load_params_file(tmp_path / "rig.yaml")
     config = build(values)
@@ -81,8 +80,7 @@ def test_a_pair(pair, tmp_path, capsys):
     np.testing.assert_allclose(turn.as_matrix(), rotation.T, atol=1e-12)
     # The file alone tells replay the cameras, their shutters and their lenses.
     words = ["--camera", str(tmp_path / "rig.yaml"), "--out", str(tmp_path / "poses")]
-    assert main(["replay", pair, *words]) == 0
-    assert "tracked from the frame before" in capsys.readouterr().out
+    assert "tracked from the frame before" in ran("replay", pair, *words).out
 
 
 def test_an_even_motion_determines_nothing(rig, tmp_path, capsys):
@@ -95,14 +93,13 @@ def test_an_even_motion_determines_nothing(rig, tmp_path, capsys):
     assert not (tmp_path / "rig.yaml").exists()
 
 
-def test_faults_are_named_before_anything_is_read(pair, tmp_path, capsys):
+def test_faults_are_named_before_anything_is_read(pair, tmp_path, ran):
     missing, lens = tmp_path / "rear.mp4", tmp_path / "lens_rear.yaml"
     lens.touch()
     out = ["--out", str(tmp_path / "rig.yaml"), "--camera-info", str(tmp_path / "lens.yaml")]
     for words, text in (([pair, str(missing)], f"{missing} does not exist"),
                         ([pair, *out], f"{lens} exists")):  # fmt: skip
-        assert main(["calibrate", "--rig", *words]) == 1
-        said = capsys.readouterr()
+        said = ran("calibrate", "--rig", *words, code=1)
         assert text in said.err
         assert said.out == ""
 

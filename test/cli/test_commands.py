@@ -45,9 +45,8 @@ def test_as_a_module():
     assert (done.returncode, done.stdout, done.stderr) == (0, version, "")
 
 
-def test_help_names_every_command_with_an_example(capsys):
-    assert main(["--help"]) == 0
-    text = capsys.readouterr().out
+def test_help_names_every_command_with_an_example(ran):
+    text = ran("--help").out
     for name, command in COMMANDS.items():
         assert f"  {name} " in text
         assert f"$ {command.example}\n" in text
@@ -55,9 +54,8 @@ def test_help_names_every_command_with_an_example(capsys):
 
 
 @pytest.mark.parametrize("name", list(COMMANDS))
-def test_every_command_has_help_and_takes_its_example(name, capsys):
-    assert main([*name.split(), "--help"]) == 0
-    text = capsys.readouterr().out
+def test_every_command_has_help_and_takes_its_example(name, ran):
+    text = ran(*name.split(), "--help").out
     assert f"usage: rs_localizer {name}" in text
     assert COMMANDS[name].example in text
     module = importlib.import_module(COMMANDS[name].module)
@@ -106,9 +104,8 @@ for words in {[name.split() for name in COMMANDS]}:
         (["calibrate", "--rig", "a.mp4", "b.mp4", "--imu"], "--imu is for one camera"),
     ],
 )
-def test_wrong_usage(words, text, capsys):
-    assert main(words) == 2
-    captured = capsys.readouterr()
+def test_wrong_usage(words, text, ran):
+    captured = ran(*words, code=2)
     assert text in captured.err
     assert captured.err.count("\n") == 1
     assert captured.out == ""
@@ -140,20 +137,17 @@ def raising(error: BaseException) -> Any:
         (KeyboardInterrupt(), 130, "rs_localizer replay: interrupted\n"),
     ],
 )
-def test_faults_are_one_line_and_an_exit_code(error, code, text, command, capsys):
+def test_faults_are_one_line_and_an_exit_code(error, code, text, command, ran):
     command.run = raising(error)
-    assert main(["replay"]) == code
-    said = capsys.readouterr()
+    said = ran("replay", code=code)
     assert said.out == "frame \\x1b]0;title\\x07 \\x9b2J\n\tä\n"
     assert said.err.endswith(text)
-    assert main(["replay", "-q"]) == code
-    assert capsys.readouterr() == ("", said.err)
+    assert ran("replay", "-q", code=code) == ("", said.err)
 
 
-def test_tracebacks_are_those_of_faults_in_the_program_and_of_verbose(command, capsys):
+def test_tracebacks_are_those_of_faults_in_the_program_and_of_verbose(command, ran):
     command.run = raising(ValueError("a fault"))
-    assert main(["replay", "-v"]) == 1
-    said = capsys.readouterr().err
+    said = ran("replay", "-v", code=1).err
     assert "Traceback" in said
     assert said.endswith("rs_localizer replay: a fault\n")
     command.run = raising(TypeError("a bug"))
@@ -188,15 +182,14 @@ def test_a_signal_while_the_workplace_is_removed(tmp_path, monkeypatch, command)
         (None, {"text": ["a line", "next: rs_localizer evaluate"]}),
     ],
 )
-def test_what_a_command_prints_as_json(result, told, command, capsys):
+def test_what_a_command_prints_as_json(result, told, command, ran):
     def run(options: Any) -> object:
         sys.stdout.write("a line\nnext: rs_localizer evaluate\n")
         return result
 
     command.run = run
     for words in (["replay", "--json"], ["--json", "replay"]):
-        assert main(words) == 0
-        assert json.loads(capsys.readouterr().out) == {"command": "replay", **told}
+        assert json.loads(ran(*words).out) == {"command": "replay", **told}
 
 
 # A module that tells that it is being imported, and takes its time.

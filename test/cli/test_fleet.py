@@ -48,10 +48,9 @@ def differing(one: filecmp.dircmp[str]) -> list[str]:
     return [*one.left_only, *one.right_only, *other, *unreadable, *below]
 
 
-def test_two_workers_write_the_bytes_of_one_process(recordings, tmp_path, capsys):
+def test_two_workers_write_the_bytes_of_one_process(recordings, tmp_path, capsys, ran):
     words, out = ["replay", *recordings, *SHUTTER, "--workers", "2"], tmp_path / "out"
-    assert main([*words, "--out", str(out)]) == 1
-    said = capsys.readouterr()
+    said = ran(*words, "--out", out, code=1)
     failed = f"rs_localizer replay: 1 of 3 recordings failed; {out}/summary.csv says why\n"
     assert said.err == failed
     table = rows(out)
@@ -77,7 +76,7 @@ def instead(monkeypatch: pytest.MonkeyPatch, work: Callable[[Task], Outcome] | N
     )
 
 
-def test_results_of_other_settings_are_in_the_way(recordings, tmp_path, monkeypatch, capsys):
+def test_results_of_other_settings_are_in_the_way(recordings, tmp_path, monkeypatch, ran):
     instead(monkeypatch, None)
     out = tmp_path / "out"
     words = ["replay", *recordings, "--out", str(out), *SHUTTER]
@@ -85,8 +84,7 @@ def test_results_of_other_settings_are_in_the_way(recordings, tmp_path, monkeypa
     (out / "a_flight" / "mine").write_text("")
     for text in ("no marker", '{"settings": "another", "recording": "a", "figures": {}}'):
         (out / "a_flight" / "fleet.json").write_text(text)
-        assert main(words) == 1
-        assert f"{out}/a_flight exists and is no result of this" in capsys.readouterr().err
+        assert f"{out}/a_flight exists and is no result of this" in ran(*words, code=1).err
     assert main([*words, "--overwrite"]) == 1
     assert (out / "a_flight" / "mine").exists()  # until there is a better one
     assert rows(out)["b_flight"]["reason"] == "not done"
@@ -161,7 +159,7 @@ def test_a_recording_that_kills_its_process_does_not_stop_the_others(tmp_path, m
 
 
 def test_ctrl_c_leaves_whole_results_only_and_the_next_run_goes_on(
-    recordings, tmp_path, monkeypatch, capsys
+    recordings, tmp_path, monkeypatch, ran
 ):
     """As from a terminal: every process of the group gets the signal."""
     bags = [str(tmp_path / "in" / str(k)) for k in range(3)]
@@ -184,6 +182,5 @@ def test_ctrl_c_leaves_whole_results_only_and_the_next_run_goes_on(
     assert {path.name for path in out.iterdir() if path.is_dir()} == done
     assert all((out / name / "fleet.json").is_file() for name in done)
     instead(monkeypatch, perform_task)
-    assert main(words) == 0
-    assert f"{len(done)} of 3 recordings have been done before\n" in capsys.readouterr().out
+    assert f"{len(done)} of 3 recordings have been done before\n" in ran(*words).out
     assert {row["reason"] for row in rows(out).values()} == {""}

@@ -63,11 +63,10 @@ def images(film):
     return lambda which: film(which, "images", *words, "--noise", "2")
 
 
-def test_poses_of_a_detector_of_each_camera(images, tmp_path, capsys):
+def test_poses_of_a_detector_of_each_camera(images, tmp_path, ran):
     bag, seen, out = images("pair"), str(tmp_path / "seen"), tmp_path / "poses"
     words = ["--map", str(bag / MARKER_MAP), "--out", seen]
-    assert main(["detect", str(bag), *words]) == 0
-    said = capsys.readouterr().out
+    said = ran("detect", bag, *words).out
     assert "up: " in said
     assert "down: " in said
     assert "kept for replay: /tf_static (1)" in said
@@ -129,7 +128,7 @@ def test_a_readout_time_that_the_images_contradict_is_refused(images, tmp_path, 
     assert not wall.exists()
 
 
-def test_a_map_is_refined(film, tmp_path, capsys):
+def test_a_map_is_refined(film, tmp_path, ran):
     words = ("--keypoints", "--duration", "1", "--points", "80", "--noise", "0.3")
     flight, out = film("alone", "flight", *words), tmp_path / "refined.npz"
     true = read_map_file(flight / "map.npz", "map")
@@ -137,8 +136,7 @@ def test_a_map_is_refined(film, tmp_path, capsys):
     write_npz(tmp_path / "off.npz", replace(true, points=true.points + off))
     words = ["--params", str(flight / "parameters.yaml"), "--map", str(tmp_path / "off.npz")]
     words = ["map", "refine", str(flight), *words, "-p", "map_deviation:=0.02", "--out", str(out)]
-    assert main(words) == 0
-    said = capsys.readouterr().out
+    said = ran(*words).out
     assert "noise after" in said
     found = read_map_file(out, "map")
     assert found.covariances is not None
@@ -147,5 +145,4 @@ def test_a_map_is_refined(film, tmp_path, capsys):
     errors = off_the_truth(found.points[known], true.points[known])
     assert np.median(errors) < 0.7 * np.median(np.linalg.norm(off, axis=1)[known])
     assert found.descriptors is not None
-    assert main(words) == 1
-    assert "exists; choose another OUT" in capsys.readouterr().err
+    assert "exists; choose another OUT" in ran(*words, code=1).err

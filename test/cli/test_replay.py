@@ -64,10 +64,9 @@ def test_results_that_wait_for_frames_come_at_the_end(recording, tmp_path):
     assert not np.array_equal(later.positions, at_once.positions)
 
 
-def test_what_comes_out(recording, tmp_path, capsys):
+def test_what_comes_out(recording, tmp_path, ran):
     out = tmp_path / "deep" / "out"
-    assert main(["replay", str(recording), "--out", str(out), *SHUTTER]) == 0
-    captured = capsys.readouterr()
+    captured = ran("replay", recording, "--out", out, *SHUTTER)
     assert captured.err == ""  # no progress bar where nobody watches
     rows = dict(line.rsplit(None, 1) for line in captured.out.splitlines())
     assert rows["frames"] == rows["localized"] == str(FRAMES)
@@ -170,14 +169,13 @@ def test_frames_that_are_not_refined_stand_alone(recording, tmp_path, capsys, ki
     assert np.isnan(known).all() == (kind == "none")
 
 
-def test_no_frame_localized_is_a_failure(recording, tmp_path, capsys):
+def test_no_frame_localized_is_a_failure(recording, tmp_path, ran):
     with BagWriter(tmp_path / "empty") as bag:
         for topic, stamp_ns, message in messages(recording):
             if topic == "/correspondences":
                 message.width, message.row_step, message.data = 0, 0, np.zeros(0, np.uint8)
             bag.write(topic, message, stamp_ns)
-    assert main(["replay", str(tmp_path / "empty"), "--out", str(tmp_path / "out")]) == 1
-    captured = capsys.readouterr()
+    captured = ran("replay", tmp_path / "empty", "--out", tmp_path / "out", code=1)
     assert f"no frame of {tmp_path / 'empty'} was localized" in captured.err
     assert "refused: empty_cloud" in captured.out
 
@@ -207,7 +205,7 @@ def test_frames_are_written_as_they_come_and_let_go(recording, tmp_path, monkeyp
     assert most < 10
 
 
-def test_notices_stand_in_the_summary(recording, tmp_path, monkeypatch, capsys):
+def test_notices_stand_in_the_summary(recording, tmp_path, monkeypatch, ran):
     real = results.replay
 
     def odd(bag: Any, topics: Any, localizer: Any) -> Any:
@@ -216,7 +214,6 @@ def test_notices_stand_in_the_summary(recording, tmp_path, monkeypatch, capsys):
             yield item
 
     monkeypatch.setattr(results, "replay", odd)
-    assert main(["replay", str(recording), "--out", str(tmp_path / "out"), *SHUTTER]) == 0
-    said = capsys.readouterr().out
+    said = ran("replay", recording, "--out", tmp_path / "out", *SHUTTER).out
     assert re.search(rf"noticed: readout_time +{FRAMES}\n", said)
     assert f"readout_time: estimated readout time {FRAMES - 1} ms differs" in said

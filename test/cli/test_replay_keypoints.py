@@ -25,7 +25,7 @@ LANDMARKS = Map(
 )
 
 
-def test_a_recording_of_everything(tmp_path, capsys):
+def test_a_recording_of_everything(tmp_path, capsys, ran):
     """By the id or by the points themselves: the frames since the map came are the same."""
     seen = FrameSettings(points=80, noise=0.5, outliers=0.2)
     with BagWriter(tmp_path / "all") as bag:
@@ -43,8 +43,7 @@ def test_a_recording_of_everything(tmp_path, capsys):
                 message = make_cloud(make_message, 0, "map", map_rows(LANDMARKS))
                 bag.write("/cam/map_points", message, frame.stamp_ns - 1)
     words = ["replay", str(tmp_path / "all"), *SHUTTER]
-    assert main(words) == 1
-    assert "choose with -r correspondences:=TOPIC or -r keypoints:=TOPIC" in capsys.readouterr().err
+    assert "choose with -r correspondences:=TOPIC or -r keypoints:=TOPIC" in ran(*words, code=1).err
     found = {}
     for name, given in {
         "clouds": ["-r", "correspondences:=/correspondences"],

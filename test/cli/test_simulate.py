@@ -138,14 +138,12 @@ def detect(image: np.ndarray) -> dict[int, np.ndarray]:
     return found
 
 
-def test_replay_uses_it_and_says_so(tmp_path, capsys):
+def test_replay_uses_it_and_says_so(tmp_path, ran):
     record(tmp_path / "bag", *SHORT, *TURN, "--imu")
     replay = ["replay", str(tmp_path / "bag"), "-p", "readout_time:=0.03"]
-    capsys.readouterr()
     poses = []
     for name, words in (("both", []), ("alone", ["-p", "imu.use:=none"])):
-        assert main([*replay, "--out", str(tmp_path / name), *words]) == 0
-        said = capsys.readouterr().out
+        said = ran(*replay, "--out", tmp_path / name, *words).out
         assert ("localized with the IMU" in said) == (name == "both")
         if name == "both":
             assert re.search(r"localized with the IMU +(9\d\.\d|100\.0)%", said)
@@ -153,6 +151,5 @@ def test_replay_uses_it_and_says_so(tmp_path, capsys):
         poses.append((tmp_path / name / "poses.txt").read_bytes())
     assert poses[0] != poses[1]
     more = [*replay, "--out", str(tmp_path / "n"), "-r"]
-    assert main([*more, "imu:=/nowhere"]) == 1
-    assert "topic /nowhere does not exist" in capsys.readouterr().err
+    assert "/nowhere does not exist" in ran(*more, "imu:=/nowhere", code=1).err
     assert main([*more, "imo:=/imu"]) == 2
