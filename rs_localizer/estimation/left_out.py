@@ -292,7 +292,8 @@ def _another_lens(
         start = search.rough(through)
         if start.found:
             errors = through.observations.squared_errors(start.state)
-            found, off = min(np.count_nonzero(errors < circle**2), enough), float(np.median(errors))
+            near, off = int(np.count_nonzero(errors < circle**2)), float(np.median(errors))
+            found = min(near, enough)
             if found > most or (of_size and found == most and off < least):
                 most, least, state, lens, gate = found, off, start.state, tried, 2.0 * circle
         if most >= enough and not of_size:

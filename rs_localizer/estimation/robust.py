@@ -60,7 +60,8 @@ def apply_step(state: Array1, step: Array1) -> Array:
 @kernel
 def _scaled(row: Array, least: float) -> bool:
     """Divide a row by the root of its pivot; return whether that is more than the least one."""
-    positive, scale = row[0] > least, 1.0 / math.sqrt(max(row[0], least))
+    positive: bool = row[0] > least
+    scale = 1.0 / math.sqrt(max(row[0], least))
     for j in range(len(row)):
         row[j] *= scale
     return positive
