@@ -137,7 +137,7 @@ def calibration_effect(
         by_point = by_motion[:, :, MOVE] @ rotation_of(posterior.state)
         columns = np.concatenate([columns, by_point @ moved], axis=2)
     bend = posterior.bend[chosen] if posterior.bend.shape[1] else np.zeros((len(rays), 0))
-    parts = posterior.speeds if len(posterior.speeds) else _CONFIGURED
+    of_speeds = posterior.speeds if len(posterior.speeds) else _CONFIGURED
     smooth = posterior.shared * smooth_columns(by_motion, image, bend)
     variance, fitted = posterior.noise**2, PARAMETERS + smooth.shape[2]
     rows = np.concatenate([by_motion, smooth, columns], axis=2).reshape(2 * len(rays), -1)
@@ -158,7 +158,7 @@ def calibration_effect(
         crossed[motion] - explained @ crossed[PARAMETERS:],
     )
     inverses = np.zeros((2, PARAMETERS, PARAMETERS))  # with and without the smooth error
-    for speed, part in zip(SPEEDS, parts.tolist(), strict=True):
+    for speed, part in zip(SPEEDS, of_speeds.tolist(), strict=True):
         if part > _NO_PART:
             of_speed = terms_at(terms, speed, rotation is not None)
             prior = variance * known_at(of_speed, posterior.state).form[motion, motion]
