@@ -534,8 +534,8 @@ def _over_turns(
     for k in range(count):
         means[k] = math.sqrt(weights[k]) * (means[k] + mean)
         if weights[k] >= least:
-            half = half_of(wholes[k])
-            covariance += (share * weights[k] * left[k]) * (half.T @ half)
+            half = math.sqrt(share * weights[k] * left[k]) * half_of(wholes[k])
+            covariance += half.T @ half
     covariance += means.T @ means
     return mean, covariance, best + math.log(total), np.sum(weights * left), weights
 
