@@ -34,12 +34,10 @@ _BEYOND = 4.5
 _OF_DISTORTION = 0.6
 # So many of so many frames that another camera matrix explains are no chance: of twelve real boards
 # none has one.
-_OTHERS, _OF_THE_LAST = 3, 30
+_OTHERS, _OF_THE_LAST = 2, 30
 # Frames are compared again after as many as before, and after so many at most: it takes 5 to 30 ms.
 # Others follow sooner as long as these do not tell the focal length.
 _RARELY, _SOON = 192, 8
-# Frames whose shares of inliers differ more show different parts of the map.
-_SAME_SHARE = 0.8
 # Intervals (s) over which a parabola is a hand's motion.
 _LONGEST_INTERVAL = 0.15
 # Beyond this (logarithm) fy over fx is not the image's, and no pose is told.
@@ -149,9 +147,6 @@ class LensWatch:
         self._posed.append(frame)
         self._count += 1
         if len(self._posed) < FRAMES or self._count < self._next:
-            return
-        shares = [float(np.mean(each.found.inliers)) for each in self._posed]
-        if min(shares) < _SAME_SHARE * max(shares):
             return
         self._together.add(list(self._posed))
         most = _RARELY if self._together.is_enough else _SOON

@@ -46,13 +46,13 @@ def test_a_calibration_is_held_to_what_it_promises():
     assert watched(3.5, CalibrationErrors()).fault == ""
 
 
-def test_three_frames_that_another_matrix_explains_refuse_all_until_they_are_old():
+def test_two_frames_that_another_matrix_explains_refuse_all_until_they_are_old():
     watch = LensWatch(None, LocalizerConfig())
     other = Failure(Reason.CALIBRATION, "K is that of another image")
     random = np.random.default_rng(1)
     camera, *seen, _ = frame("volume", "right", random)
     found = rsl.Localizer(camera).localize(*seen)
-    for _ in range(3):
+    for _ in range(2):
         assert watch.refusal == ""
         watch.add(0, other, *seen)
         watch.add(0, found, *seen)
