@@ -197,12 +197,11 @@ def stabilised(share: float, zoom: float, seen: Seen, rng: np.random.Generator) 
     return seen._replace(pixels=zoom * bearings * np.diag(seen.K)[:2] + seen.K[:2, 2])
 
 
-def half_moved(distance: float, seen: Seen, rng: np.random.Generator) -> Seen:
-    """Half of the map lies elsewhere than the map says."""
+def part_moved(share: float, distance: float, seen: Seen, rng: np.random.Generator) -> Seen:
+    """A part of the map lies elsewhere than the map says."""
     points, shift = seen.points.copy(), rng.normal(size=3)
-    some = rng.normal(size=3)
-    half = points @ some > np.median(points @ some)
-    points[half] += distance * shift / np.linalg.norm(shift)
+    along = points @ rng.normal(size=3)
+    points[along > np.quantile(along, 1.0 - share)] += distance * shift / np.linalg.norm(shift)
     return seen._replace(points=points)
 
 
@@ -245,8 +244,10 @@ def kinds() -> list[Kind]:
         Kind("mild lens, rectified, usual", _corner, partial(rectified, 1.0), camera=_MILD),
         Kind("stabilised, corner", _corner, partial(stabilised, 0.7, 1.0), settings=well),
         Kind("stabilised and zoomed, room", _room, partial(stabilised, 0.7, 1.1)),
-        Kind("half map moved 1 cm, corner", _corner, partial(half_moved, 0.01)),
-        Kind("half map moved 3 cm, room", _room, partial(half_moved, 0.03)),
+        Kind("half map moved 1 cm, corner", _corner, partial(part_moved, 0.5, 0.01)),
+        Kind("half map moved 3 cm, room", _room, partial(part_moved, 0.5, 0.03)),
+        Kind("half map moved 10 cm, room", _room, partial(part_moved, 0.5, 0.1)),
+        Kind("third moved 1 cm, corner", _corner, partial(part_moved, 1.0 / 3.0, 0.01)),
         Kind("map stretched by 1 %, corner", _corner, partial(stretched, 0.01)),
         Kind("map stretched by 1 %, wall", _wall, partial(stretched, 0.01)),
         Kind("so, map_deviation 5 mm, wall", _wall, partial(stretched, 0.01),

@@ -32,7 +32,7 @@ def said(fault: kinds.Fault, **fields: Any) -> tuple[set[int], set[int], str]:
 
 
 def test_half_of_a_map_that_was_moved_is_named_with_its_ids():
-    moved, named, text = said(partial(kinds.half_moved, 0.01))
+    moved, named, text = said(partial(kinds.part_moved, 0.5, 0.01))
     assert len(named) >= 8
     assert named <= moved or named.isdisjoint(moved)  # either half may be the one that was moved
     words = text.split()
@@ -55,7 +55,7 @@ def test_no_landmark_is_named_for_a_lens_or_a_map_that_is_stretched(fault):
 
 def test_a_declared_deviation_explains_what_it_is_as_large_as():
     declared = NodeConfig(map_deviation=0.005)
-    assert said(partial(kinds.half_moved, 0.01), settings=declared)[2] == ""
+    assert said(partial(kinds.part_moved, 0.5, 0.01), settings=declared)[2] == ""
 
 
 def test_a_camera_that_turns_on_the_spot_finds_the_part():
