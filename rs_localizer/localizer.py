@@ -276,7 +276,7 @@ class Localizer:
         return checked_of_rig(self.rig, points, stamps)
 
     def _found(self, given: _Inputs) -> Estimate | Failure:
-        exposure, counts, points, pixels, scores, prior, expected_share, rotation, *of_map = given
+        exposure, counts, points, pixels, scores, prior, expected_share, rotation, *_ = given
         terms, assumed = self._assume(exposure.span)
         if prior is not None or rotation is not None:
             terms, assumed = of_frame(terms, assumed, prior, rotation)
@@ -295,7 +295,8 @@ class Localizer:
             points,
             usable,
             rotation,
-            *of_map,
+            given.error_modes,
+            given.parts,
         )
         # 2. Near the predicted motion, if the points agree with it (tracking).
         if prior is not None and prior.motion is not None:

@@ -7,10 +7,10 @@ Let a part ``P`` of the landmarks be shifted by ``d``. A frame is then off by
     e_i = J_i d [i in P] + A_i x + noise
 
 ``J`` is the derivative by the landmark's place. ``x`` is the motion of the frame and the smooth
-error of its image, each with its prior. One shift and one part, of one frame or of some, must
-explain more than chance: the evidence of the split, whose labels cost what they tell, is compared
-with that of one group. Which part is where the map says is not told. Each is by the number of its
-landmarks, because a part is one thing, however many of its landmarks a frame shows.
+error of its image, each with its prior. One shift and one part must explain more than chance, in
+one frame or in some: the evidence of the split, whose labels cost what they tell, beside that of
+one group. Which part is where the map says is not told. Either may be, with the share of its
+landmarks: a part is one thing, however many of its landmarks a frame shows.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _RIDGE = 1e-9
 
 
 class Look(NamedTuple):
-    """What a frame leaves of its landmarks, linearized at its motion."""
+    """Errors of a frame's landmarks, linearized at its motion."""
 
     points: Array  # (n,3) m, as the map has them
     errors: Array  # (n,2) px
@@ -257,7 +257,7 @@ def _beside(look: Look, kept: BoolArray, declared: bool = True) -> tuple[Array, 
     prior[smooth, smooth] /= max(look.sizes[declared], LEAST_NOISE) ** 2
     weight = normal + prior
     weight[np.diag_indices(len(weight))] *= 1.0 + _RIDGE
-    inverse = np.linalg.inv(weight)
+    inverse: Array = np.linalg.inv(weight)
     return flat, inverse, float(np.sum(inverse * normal))
 
 
@@ -278,7 +278,7 @@ def _settled(frames: _Frames, part: BoolArray) -> _Split | None:
         fit = _fitted(frames, part, kept)
         before, part = part, fit.costs[1] < fit.costs[0]
         near = [
-            np.where(part[own], *each[::-1]) < look.reach**2
+            np.where(part[own], each[1], each[0]) < look.reach**2
             for look, own, each in zip(frames.looks, frames.which, fit.apart, strict=True)
         ]
         settled = np.array_equal(part, before) and all(map(np.array_equal, near, kept))
