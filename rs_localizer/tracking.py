@@ -197,8 +197,13 @@ class Tracker:
 
     @property
     def moved(self) -> MovedPart | None:
-        """The part of the map that frames of a single camera show elsewhere; None: none."""
-        return self._parts.part
+        """The part of the map that frames of a single camera show elsewhere; None: none.
+
+        What is no larger than smooth errors may be, as of paper that is creased, is allowed for
+        only.
+        """
+        newest = self._seen[-1].found if self._seen else None
+        return self._parts.part if newest and self.lens.is_beyond(newest) else None
 
     def mount(self, rig: Rig) -> None:
         """Set new mounts of the same cameras; the rig's axes stay the same."""
