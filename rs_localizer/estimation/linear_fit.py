@@ -264,7 +264,9 @@ def smooth_error(lines: Lines, chosen: BoolArray1, bend: Array2, size: float) ->
     squares = values[kept]
     rows = flat @ np.ascontiguousarray(axes[:, kept]) / np.sqrt(squares)
     if of_image:
-        rows, squares = np.kron(rows, np.eye(2)), np.repeat(squares, 2)
+        each, rows = rows, np.zeros((2 * len(rows), 2 * len(squares)))
+        rows[::2, ::2] = rows[1::2, 1::2] = each
+        squares = np.repeat(squares, 2)
     return Shared(rows, squares, size * np.exp(_SIZES), _ODDS.copy())
 
 
