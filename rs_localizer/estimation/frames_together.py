@@ -40,8 +40,9 @@ _MOST = 60
 # Threes that are kept: those that tell most of the focal length (its logarithm). It is known if its
 # deviation is less than the second.
 _KEPT, _KNOWN = 8, 0.02
-# Rounds of Gauss and Newton, the last of which moves no pose and no number by more than this. A
-# three is linearized anew if the shared numbers are farther away than the last.
+# Rounds of Gauss and Newton, the last of which moves no pose and no number by more than this (with
+# 4e-3 wrong lenses are told late). A three is linearized anew if the shared numbers are farther
+# away than the last.
 _ROUNDS, _LEAST_STEP, _NEAR = 12, 1e-3, (0.3, 0.05, 0.02)
 _LEAST_NOISE = 0.1  # px, no real error is smaller
 # So many threes in a row that do not fit those before are no chance.
@@ -215,7 +216,7 @@ class _Three:
         errors, columns = (np.concatenate(part) for part in zip(*lines, strict=True))
         squared = np.square(errors).sum(axis=1)
         squared = np.where(np.isnan(squared), np.inf, squared)
-        near = np.isfinite(columns).all(axis=(1, 2)) & np.isfinite(squared)
+        near = np.isfinite(columns.sum(axis=(1, 2)) + squared)
         variance = max(_variance(squared), least)
         weights = np.repeat(1.0 / (variance + squared[near] / 9.0), 2)
         rows, off = columns[near].reshape(-1, _OWN + _SHARED), errors[near].ravel()
@@ -283,24 +284,24 @@ class _Three:
         moving = speeds + np.outer([_CUBIC[k], 0.0], self.own[_BESIDE])
         state = np.concatenate([rotation.ravel(), -rotation @ place, moving.ravel()])
         lines = linearized(through.packed, len(through), state, np.zeros((len(through), 6)))
+        by_poses = np.zeros((2, 6, _STAMP))  # of the ways
+        for each, way, other in zip(by_poses, ways, frame.others, strict=True):
+            turn, about = rotation @ self.poses[other][0].T, _inverse_jacobian(way[:3])
+            each[:3, 6 * k : 6 * k + 3] = -about
+            each[:3, 6 * other : 6 * other + 3] = about @ turn
+            each[3:, 6 * k : 6 * k + 3] = so3.hat(way[3:])
+            each[3:, 6 * k + 3 : 6 * k + 6] = -np.eye(3)
+            each[3:, 6 * other + 3 : 6 * other + 6] = turn
         by_number = np.zeros((lines.by_motion.shape[2], _OWN + 1))  # of the motion within the frame
-        own = slice(6 * k, 6 * k + 6)
-        by_number[:6, own] = np.eye(6)
-        for way, other, slopes in zip(ways, frame.others, by_way.T, strict=True):
-            turn = rotation @ self.poses[other][0].T
-            about = np.linalg.inv(so3.right_jacobian(-way[:3]))
-            by_own, by_other = -np.eye(6), np.zeros((6, 6))
-            by_own[:3, :3], by_own[3:, :3] = -about, so3.hat(way[3:])
-            by_other[:3, :3], by_other[3:, 3:] = about @ turn, turn
-            for part, weight in enumerate(per_time * slopes, start=1):
-                rows = slice(6 * part, 6 * part + 6)
-                by_number[rows, own] += weight * by_own
-                by_number[rows, 6 * other : 6 * other + 6] = weight * by_other
+        by_number[:6, 6 * k : 6 * k + 6] = np.eye(6)
+        slopes = per_time[:, None] * by_way @ by_poses.reshape(2, -1)
+        by_number[6:, :_STAMP] = slopes.reshape(-1, _STAMP)
         by_number[6:, _STAMP] = by_stamp.ravel()
         by_number[VELOCITIES, _BESIDE] = _CUBIC[k] * np.eye(6)
         by_number[6:, _OWN + _READOUT] = (speeds * [[1.0], [2.0]]).ravel() / readout
         columns = np.zeros((len(through), 2, _OWN + _SHARED))
-        columns[:, :, : _OWN + 1] = lines.by_motion @ by_number
+        by_motion = lines.by_motion.reshape(2 * len(through), -1)  # one product, not one a point
+        columns[:, :, : _OWN + 1] = (by_motion @ by_number).reshape(len(through), 2, -1)
         shared = columns[:, :, _OWN:]
         by_length = through.by_ray * lines.image[:, None, :]
         shared[:, :, _LENGTH] = by_length.sum(axis=2) + seen.by_ray @ (length * principal)
@@ -309,7 +310,8 @@ class _Three:
         shared[:, [0, 1], [_LENS.start, _LENS.start + 1]] = 1.0
         shared[:, :, _LENS.stop - 1] = np.einsum("nij,nj->ni", seen.by_ray, radial)
         shared[:, :, _LENS.stop - 1] /= self._focal_length
-        shared[:, :, _MAP] = lines.by_motion[:, :, MOVE] @ rotation @ frame.moved
+        by_point = (by_motion[:, MOVE] @ rotation).reshape(-1, 2, 3)
+        shared[:, :, _MAP] = by_point @ frame.moved
         errors = lines.errors + shared[:, :, _LENS.start :] @ numbers[_LENS.start :]
         return errors, columns
 
@@ -393,7 +395,7 @@ class FramesTogether:
         return told
 
     def _from_anywhere(self, posed: Sequence[Sequence[Fitted]]) -> tuple[_Fit, list[_Three], Array]:
-        """Return the best fit from other focal lengths, as each frame may hide what is wrong."""
+        """Return a fit from other focal lengths, as each frame may hide what is wrong."""
         assert self._map is not None
         camera, best = self._exposure.cameras[0], (_NO_FIT, list[_Three](), np.zeros(2))
         for principal in (np.zeros(2), centre_of(camera) / camera.focal_length):
@@ -403,8 +405,8 @@ class FramesTogether:
                 fit = self._fitted(threes, start, principal)
                 if fit.cost < best[0].cost:
                     best = fit, threes, principal
-            if best[1] and self._fits(*best[:2]):
-                break
+                if best[1] and self._fits(*best[:2]):
+                    return best
         return best
 
     def _fits(self, fit: _Fit, threes: Sequence[_Three]) -> bool:
@@ -483,6 +485,13 @@ def _frames(exposure: Exposure, posed: Sequence[Fitted], map_: _Landmarks) -> li
         there = times[others] - times[k]
         frames.append(_Linked(seen, (others[0], others[1]), there, shifted, moved))
     return frames
+
+
+def _inverse_jacobian(turn: Array) -> Array:
+    """Return the inverse (3,3) of the right Jacobian at minus a small rotation vector (3,)."""
+    hat = so3.hat(turn)
+    inverse: Array = np.eye(3) - 0.5 * hat + hat @ hat / 12.0
+    return inverse
 
 
 def _variance(squared: Array) -> float:
