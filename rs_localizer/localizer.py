@@ -46,6 +46,7 @@ from rs_localizer.estimation.moved_part import (
     MovedParts,
     look_at,
     moved_part,
+    neighbours_alike,
 )
 from rs_localizer.estimation.points import (
     NEAREST,
@@ -414,7 +415,7 @@ class Localizer:
     ) -> list[MovedPart]:
         """Return the parts of the map that this frame, and those before, show elsewhere."""
         here = None
-        if left_nearby(observed, posterior):
+        if left_nearby(observed, posterior) and neighbours_alike(observed, posterior):
             here = moved_part([look()], self.config.map_deviation, sides=False)
         before = observed.parts.part if observed.parts is not None else None
         return [part for part in (before, here) if part is not None]
@@ -469,7 +470,7 @@ class Localizer:
         if odd.failure is not None:
             return odd.failure
         if watched and observed.parts is not None:
-            observed.parts.add(look)
+            observed.parts.add(look, partial(neighbours_alike, observed, posterior))
         effect = widened(effect, posterior)
         estimate = estimate_of(observed, posterior, best.samples, effect, tracked)
         return replace(estimate, left_out=odd.notice) if odd.notice else estimate

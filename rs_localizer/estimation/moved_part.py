@@ -16,7 +16,6 @@ landmarks: a part is one thing, however many of its landmarks a frame shows.
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -35,19 +34,22 @@ from rs_localizer.estimation.search import GLOBAL_SHUTTER_SCALE
 
 # Frames that are compared, and after how many others at most: it takes some 20 ms.
 _LOOKS, _RARELY = 4, 60
+# Neighbours of a landmark that are compared with it, deviations of chance by which they are alike,
+# and landmarks that are enough.
+_NEIGHBOURS, _ALIKE, _COMPARED = 4, 2.0, 200
 # Splits that chance makes in one search of 1,000.
 _LEAST_CHANCE = -math.log(1e-3)
 # Declared deviations of two landmarks within which they are no two parts.
 _DECLARED = 3.0 * math.sqrt(2.0)
 # Parts from which the search starts, beyond these quantiles along the axes and their diagonals.
-_QUANTILES, _STARTS = (0.2, 0.35, 0.5, 0.65, 0.8), 3
+_QUANTILES, _STARTS = (0.2, 0.35, 0.5, 0.65, 0.8), 1
 _ALONG = np.array([
     (x, y, z) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0) for z in (-1.0, 0.0, 1.0)
 ])[14:]  # fmt: skip
 # So many landmarks have a shift, whatever they are.
 _OF_SHIFT = 2
 # Rounds of labels and fits: they mostly agree after four.
-_ROUNDS = 10
+_ROUNDS = 6
 # Of diagonals of normal equations, so that rounding leaves them positive.
 _RIDGE = 1e-9
 
@@ -130,20 +132,55 @@ class MovedParts:
         """Forget all frames."""
         self.part: MovedPart | None = None
         """The part that was last found; None: the frames that were last compared show none."""
-        self._looks: deque[Look] = deque(maxlen=_LOOKS)
+        self._looks: list[Look] = []
         self._count, self._next = 0, 1
 
-    def add(self, look: Callable[[], Look]) -> None:
-        """Take an accepted frame."""
+    def add(self, look: Callable[[], Look], alike: Callable[[], bool]) -> None:
+        """Take an accepted frame, and whether errors of neighbours in it are alike."""
         self._count += 1
-        if self._count <= self._next - _LOOKS:
-            return
+        if not self._looks:
+            if self._count < self._next:
+                return
+            self._next += min(self._count, _RARELY)
+            if not alike():
+                self.part = None
+                return
         self._looks.append(look())
-        if self._count < self._next:
-            return
-        self.part = moved_part(self._looks, self._map_deviation)
-        self._looks.clear()
-        self._next += min(self._count, _RARELY)
+        if len(self._looks) in (1, _LOOKS):
+            self.part = moved_part(self._looks, self._map_deviation)
+        if len(self._looks) == _LOOKS:
+            self._looks.clear()
+            self._next = self._count + min(self._count, _RARELY)
+
+
+def neighbours_alike(observed: Observed, posterior: Posterior) -> bool:
+    """Return whether errors of landmarks that are neighbours are alike, more than by chance.
+
+    Moran's I, of both coordinates: it takes a fraction of what a search for parts does.
+    """
+    errors, near = _errors(observed, posterior)
+    near = near[:: 1 + len(near) // _COMPARED]
+    count = len(near)
+    if count <= 2 * _NEIGHBOURS:
+        return False
+    off = errors[near] - errors[near].mean(axis=0)
+    places = observed.observations.points[near]
+    squares = np.sum(places**2, axis=1)
+    far = squares - 2.0 * places @ places.T  # but for a part that is a point's own
+    far[np.diag_indices(count)] = np.inf
+    beside = np.argpartition(far, _NEIGHBOURS, axis=1)[:, :_NEIGHBOURS]
+    products = np.einsum("na,nka->", off, off[beside]) / _NEIGHBOURS
+    index = float(products) / max(float(np.sum(off**2)), TINY)
+    return index + 1.0 / count > _ALIKE / math.sqrt(2.0 * count * _NEIGHBOURS / 1.5)
+
+
+def _errors(observed: Observed, posterior: Posterior) -> tuple[Array, IntArray]:
+    """Return errors (n,2) px of all points, and which lie near their places."""
+    seen = observed.observations
+    shake = shake_at(seen.tau, posterior.shake)
+    errors: Array = linearized(seen.packed, len(seen), posterior.state, shake).errors
+    circle = (GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length) ** 2
+    return errors, np.flatnonzero(np.sum(errors**2, axis=1) < circle)  # NaN is not
 
 
 class _Shifted(NamedTuple):
