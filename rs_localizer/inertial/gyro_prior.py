@@ -320,7 +320,7 @@ class GyroscopeTrack:
             far = max(far, _swung(found, prediction.rotation) / _MOST_SWING)
         if far > 1.0:  # a prediction that is too far off counts as much as one at the limit
             information, pull = information / far, pull / far
-            gain = np.linalg.inv(np.eye(PARAMETERS) + spread @ information)
+            gain[:] = np.linalg.inv(np.eye(PARAMETERS) + spread @ information)
         self._learn(foreseen.tied[motions], gain, information, pull)
         agrees = bool(far <= 1.0)
         self._contradictions.append(not agrees)
