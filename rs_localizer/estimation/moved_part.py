@@ -274,7 +274,7 @@ def _fitted(
         freedom += len(errors) - taken
         solved.append((beside, back))
     information += max(_RIDGE * float(np.trace(information)), TINY) * np.eye(3)
-    way: Array = np.linalg.solve(information, target)
+    way = np.asarray(np.linalg.solve(information, target), np.float64)
     costs, apart = np.zeros((2, len(part))), []
     for look, own, (beside, back) in zip(frames.looks, frames.which, solved, strict=True):
         left = look.errors - look.columns @ (back - beside @ way)
@@ -294,7 +294,7 @@ def _beside(look: Look, kept: BoolArray, declared: bool = True) -> tuple[Array, 
     prior[smooth, smooth] /= max(look.sizes[declared], LEAST_NOISE) ** 2
     weight = normal + prior
     weight[np.diag_indices(len(weight))] *= 1.0 + _RIDGE
-    inverse: Array = np.linalg.inv(weight)
+    inverse = np.asarray(np.linalg.inv(weight), np.float64)
     return flat, inverse, float(np.sum(inverse * normal))
 
 

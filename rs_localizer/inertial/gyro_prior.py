@@ -311,7 +311,7 @@ class GyroscopeTrack:
         spread, information = foreseen.covariance[motions, motions].copy(), told.information
         start = state_in(foreseen.motion, np.zeros(3))
         pull = told.gradient + information @ step_between(start, told.state)
-        gain = np.linalg.inv(np.eye(PARAMETERS) + spread @ information)
+        gain = np.asarray(np.linalg.inv(np.eye(PARAMETERS) + spread @ information), np.float64)
         step, gained = gain @ spread @ pull, spread @ information @ gain @ spread
         seen = np.ix_(_SEEN, _SEEN)
         expected = gained[seen] + _LEAST_GAIN * spread[seen]
@@ -409,7 +409,9 @@ def _swung(found: Estimate, rotation: RotationPrior) -> float:
 
 
 # Derivatives (12,54) of turns at the row times by an in-frame turn.
-_SWINGS: Array = np.kron(shake_functions(np.array(_ROWS))[0] @ COMBINATIONS, np.eye(3))
+_SWINGS = np.asarray(
+    np.kron(shake_functions(np.array(_ROWS))[0] @ COMBINATIONS, np.eye(3)), np.float64
+)
 
 
 def _is_positive(joint: Array) -> bool:
