@@ -81,8 +81,8 @@ _GLOBAL = 0.2
 # to frame, unless it has the images' rate.
 _TAKEN_OUT, _LAST, _LEAST, _SMOOTHLY = 3.5 * _LIKE_MOTION, 30, 12, 0.6
 # Orientations widen by what such rates turn in this time (s): a hand sways at 0.8 Hz. Before it is
-# named, they do so if rows also show a readout time that is longer by this factor.
-_SWAY, _LONGER = 0.2, 1.25
+# named, they do so if rows also show a readout time that is longer by so many deviations.
+_SWAY, _LONGER = 0.2, 3.0
 # Logarithms of the odds of another shutter at which it is doubted, no longer doubted (a robot that
 # drives slowly shows neither) and certain, and of rest before a global shutter.
 _SUSPICIOUS, _SHOWN, _CERTAIN, _AT_REST = 4.0, -2.0, 8.0, 20.7
@@ -325,11 +325,12 @@ class ShutterWatch:
         rate = self._turned_beside()
         if self._unlike < _SHAKEN and np.all(np.abs(self._mean[:2]) < 0.55 * seconds):
             self._judge(usual)
-            rate *= self._mean[0] > _LONGER * usual
         elif self.kind in ("", "stabilized"):
             self.trusted, self._reversed, self._across = True, False, False
             self._name_stabilizer(rate)
-        self._taken_out = _SWAY * rate if self.kind in ("", "stabilized") else 0.0
+        longer = self._mean[0] - usual > _LONGER * math.sqrt(self._covariance[0, 0])
+        widens = self.kind == "stabilized" or (not self.kind and longer)
+        self._taken_out = _SWAY * rate if widens else 0.0
 
     def _turned_beside(self) -> float:
         """Return the rate (rad/s, rms) at which images are turned as wholes; 0: they are not."""
