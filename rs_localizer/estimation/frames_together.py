@@ -385,13 +385,16 @@ class FramesTogether:
 
     def _told(self, fit: _Fit, least: float) -> Array:
         """Return whether focal length and fy over fx (2,) are off by so many deviations."""
-        told: Array = np.abs(fit.numbers[_OF_K]) > least * np.hypot(
-            fit.deviations[_OF_K], self._usual
-        )
+        count = len(self._threes)
+        few = math.sqrt((count + 1.0) / max(count - 1.0, 0.5))  # may scatter little by chance
+        deviations = np.hypot(few * fit.deviations[_OF_K], self._usual)
+        told: Array = np.abs(fit.numbers[_OF_K]) > least * deviations
         # Rows of a squeezed image take as long as before; images that are turned as wholes look
-        # squeezed, too.
+        # squeezed, too. Where rows seem to take another time than is given, a camera that vibrates
+        # looks like another focal length.
         longer, aspect = math.log1p(max(fit.numbers[_READOUT], -0.9)), fit.numbers[_RATIO]
         told[1] &= abs(longer + aspect) < _TURNED
+        told[0] &= abs(longer + aspect) < max(least * fit.deviations[_READOUT], _EXACT)
         return told
 
     def _from_anywhere(self, posed: Sequence[Sequence[Fitted]]) -> tuple[_Fit, list[_Three], Array]:
@@ -455,10 +458,12 @@ class FramesTogether:
             numbers = numbers + step * min(1.0, _MOST_STEP / farthest)
             if farthest < _LEAST_STEP and not stale:
                 break
-        squared = [three.equations.squared_errors for three in threes if three.equations]
+        linear = [three.equations for three in threes if three.equations]
+        squared = [there.squared_errors for there in linear]
         variance = _variance(np.concatenate(squared))
         cost = sum(float(np.log1p(each / (9.0 * least)).sum()) for each in squared)
-        return _Fit(numbers, _ALIKE * np.sqrt(np.diag(covariance)), variance, cost)
+        wider = _ALIKE * _disagreement(linear, numbers)
+        return _Fit(numbers, wider * np.sqrt(np.diag(covariance)), variance, cost)
 
     def _least(self) -> int:
         """Return the three without which the focal length is known best."""
@@ -466,6 +471,21 @@ class FramesTogether:
         total = np.diag(self._known()) + sum(every)
         without = [np.linalg.inv(total - one)[_LENGTH, _LENGTH] for one in every]
         return int(np.argmin(without))
+
+
+def _disagreement(threes: Sequence[_Equations], numbers: Array) -> float:
+    """Return by how much threes scatter about common numbers, over what their equations say.
+
+    At least 1. What vibrates moves otherwise within its images than between them, each time by
+    another amount, and looks like another focal length each time.
+    """
+    if len(threes) < 2:
+        return 1.0
+    some, square = slice(0, _OF_K.stop), 0.0
+    for there in threes:
+        pull = (there.slope + there.information @ (numbers - there.numbers))[some]
+        square += float(pull @ np.linalg.pinv(there.information[some, some]) @ pull)
+    return math.sqrt(max(square / (_OF_K.stop * (len(threes) - 1)), 1.0))
 
 
 def _frames(exposure: Exposure, posed: Sequence[Fitted], map_: _Landmarks) -> list[_Linked]:
