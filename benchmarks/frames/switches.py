@@ -49,7 +49,7 @@ SWITCHES: dict[str, tuple[Switch, ...]] = {
                lambda old: lambda lines, inliers, *_: nothing_shared(int(inliers.sum()))),
     ),
     "in-frame-turn": (
-        Switch(f"{_FRAME}:_with_turn", lambda old: lambda given, hypotheses, steady: [steady]),
+        Switch(f"{_FRAME}:_with_turn", lambda old: lambda given, found, steady, asks: [steady]),
     ),
     "calibration-effect": (
         Switch("rs_localizer.localizer:calibration_effect", lambda old: lambda *args: old(

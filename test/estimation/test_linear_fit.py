@@ -135,15 +135,17 @@ def test_vibration_is_integrated_as_over_dense_matrices():
     freedom, noise = 62.0, 0.5
     white = dense.T @ dense / noise**2 + information
     first = -np.linalg.solve(white, dense.T @ errors / noise**2 + slope)
-    sizes = np.repeat(TYPICAL_SIZES, 2)
-    prior = -0.5 * (np.log(FACTORS) / np.log(10.0)) ** 2
+    fast = np.exp(-0.5 * (np.log(CYCLES / 5.0) / 0.4) ** 2) + 0.03
+    fast *= np.sqrt(np.sum(TYPICAL_SIZES**2) / np.sum(fast**2))
+    every = [factor * np.repeat(of, 2) for of in (TYPICAL_SIZES, fast) for factor in FACTORS]
+    prior = np.tile(-0.5 * (np.log(FACTORS) / np.log(10.0)) ** 2, 2)
     prior -= logsumexp(prior)
     rest = noise**2 * (
         errors @ errors / noise**2 + prior_cost
         + first @ (dense.T @ errors / noise**2 + slope)
     )  # fmt: skip
-    for factor, before in zip(FACTORS, prior, strict=True):
-        columns = turns * np.repeat(factor * sizes, 3)
+    for sizes, before in zip(every, prior, strict=True):
+        columns = turns * np.repeat(sizes, 3)
         beside = columns.T @ columns / noise**2
         across = np.linalg.solve(white, dense.T @ columns) / noise**2
         beside -= columns.T @ dense / noise**2 @ across
@@ -152,7 +154,7 @@ def test_vibration_is_integrated_as_over_dense_matrices():
         explained = noise**2 * along @ inner @ along
         left = 1.0 - explained / rest
         logs.append(before + 0.5 * np.linalg.slogdet(inner)[1] - 0.5 * freedom * np.log(left))
-        pull = middle * np.repeat(factor * sizes, 3) - across
+        pull = middle * np.repeat(sizes, 3) - across
         mean = -inner @ along
         second = rest * left / freedom / noise**2 * inner + np.outer(mean, mean)
         moments.append(pull @ second @ pull.T)
