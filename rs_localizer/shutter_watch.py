@@ -86,6 +86,8 @@ _SWAY, _LONGER = 0.2, 3.0
 # Logarithms of the odds of another shutter at which it is doubted, no longer doubted (a robot that
 # drives slowly shows neither) and certain, and of rest before a global shutter.
 _SUSPICIOUS, _SHOWN, _CERTAIN, _AT_REST = 4.0, -2.0, 8.0, 20.7
+# So many frames must show another axis: in one, a focal length that is off by 2 % looks like it.
+_SOME = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -381,7 +383,8 @@ class ShutterWatch:
         doubtful = self._far(usual, 0.0) - sideways > _SUSPICIOUS
         doubtful &= self._far(0.0, 0.0) - sideways > -_SUSPICIOUS
         self.refusal, self._across = "", doubtful or odds > _SUSPICIOUS
-        if odds > _CERTAIN or (self.kind == "axis" and odds > 0.0):
+        is_certain = odds > _CERTAIN and len(self._beside) >= _SOME
+        if is_certain or (self.kind == "axis" and odds > 0.0):
             direction = ACROSS[self._direction]
             direction = direction if across.readout_time > 0.0 else REVERSED[direction]
             self.kind = "axis"
