@@ -118,7 +118,7 @@ class Matrix(NamedTuple):
 
 
 class _Landmarks(NamedTuple):
-    """In which directions a map may be bent and stretched."""
+    """Directions in which a map may be bent and stretched."""
 
     centre: Array  # (3,)
     axes: Array  # (3,3) rows; the last is that of the least extent
@@ -394,7 +394,7 @@ class FramesTogether:
         # looks like another focal length.
         longer, aspect = math.log1p(max(fit.numbers[_READOUT], -0.9)), fit.numbers[_RATIO]
         told[1] &= abs(longer + aspect) < _TURNED
-        told[0] &= abs(longer + aspect) < max(least * fit.deviations[_READOUT], _EXACT)
+        told[0] &= abs(longer + aspect) < least * fit.deviations[_READOUT]
         return told
 
     def _from_anywhere(self, posed: Sequence[Sequence[Fitted]]) -> tuple[_Fit, list[_Three], Array]:
