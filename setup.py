@@ -124,8 +124,6 @@ setup(
             "cmeel-eigen>=3.4,<4",
             "catkin_pkg",
             "codespell==2.4.*",
-            # Against whose bundle adjustment the own one is tested.
-            "gtsam; platform_machine == 'x86_64'",
             "hypothesis",
             # AprilRobotics' detector, for what it publishes; elsewhere its build needs CMake.
             "pupil-apriltags; platform_machine == 'x86_64' and python_version < '3.14'",
