@@ -22,17 +22,13 @@ _BIAS_WALK = 1e-4  # rad/s^2/sqrt(Hz)
 _BEFORE, _AFTER = 0.6, 0.03  # s of samples before the middle row and behind it
 
 
-def believed(camera: Camera) -> core.Camera:
-    """The same camera, as the package has it."""
+def believed(camera: Camera, readout_time: float | None = None) -> core.Camera:
+    """The same camera, as the package has it, or with another readout time (s)."""
     return core.Camera(
-        width=camera.width,
-        height=camera.height,
-        K=camera.matrix,
-        D=np.array(camera.distortion),
-        distortion_model="plumb_bob",
-        readout_time=camera.readout_time,
+        camera.width, camera.height, camera.matrix, np.array(camera.distortion),
+        readout_time=camera.readout_time if readout_time is None else readout_time,
         scan_direction=camera.scan.value,
-    )
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,11 +18,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, norm
 
+from benchmarks.aided import believed
 from benchmarks.independent import cameras
 from benchmarks.independent.rotations import Array, exponential, logarithm
 from rs_localizer.cli.options import integer
 from rs_localizer.config import NodeConfig
-from rs_localizer.core.camera import Camera
 from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.features.extraction import Features
 from rs_localizer.localizer import Localizer
@@ -84,13 +84,6 @@ class Walk:
 
 def _walk(rng: np.random.Generator, turning: float, wide: float = 1.2) -> Walk:
     return Walk(rng.uniform(0.0, 2.0 * np.pi, 12), turning, wide)
-
-
-def _believed(readout_time: float) -> Camera:
-    return Camera(
-        _CAMERA.width, _CAMERA.height, _CAMERA.matrix, np.array(_CAMERA.distortion),
-        readout_time=readout_time, scan_direction=_CAMERA.scan,
-    )  # fmt: skip
 
 
 def _walls(rng: np.random.Generator, count: int) -> Array:
@@ -191,7 +184,7 @@ def bend(seed: int) -> Iterator[str]:
         ("rolling, found from 20 ms", 0.02, True, 0.0),
     ):
         freedom = MapFreedom(readout_time=free)
-        found = refine(_believed(readout), seen, start, freedom, stamp_offset=offset)
+        found = refine(believed(_CAMERA, readout), seen, start, freedom, stamp_offset=offset)
         of = found.refined & (found.sights >= 6)
         if not readout:
             yield f"{'as given':28} {np.count_nonzero(of):9} {errors(start.points)}"
@@ -263,7 +256,7 @@ def _survey(wall: bool, seeds: list[int]) -> _Errors:
     poses = grid(3, 2, 0.08) if wall else ring(rng, 12)
     size = 0.06 if wall else 0.15
     film = Film(_CAMERA, walk, np.arange(0.0, 30.0, 1.0 / 30.0))
-    camera = _believed(_READOUT)
+    camera = believed(_CAMERA)
     filmed = Filmed(camera, film.spot(poses, size, rng))
     found = survey(filmed, every_marker([family(_FAMILY)], size, {}))
     turn, origin = poses[found.markers[0].id]
@@ -355,7 +348,7 @@ def _built(film: Film, room: Array, markers: int, rng: np.random.Generator) -> B
             (one.quads.reshape(-1, 2), (4 * one.markers[:, None] + np.arange(4)).ravel())
             for one in film.spot(poses, 0.25, rng)
         ]
-    nothing, camera = Path(), _believed(_READOUT)
+    nothing, camera = Path(), believed(_CAMERA)
     none_found = np.zeros(0)
     features = Features(np.zeros((0, 2)), none_found, none_found, np.zeros((0, 1), np.float32))
     views = [
@@ -376,7 +369,7 @@ def _localized(
     film: Film, true: Array, points: Array, modes: ErrorModes, rng: np.random.Generator
 ) -> Iterator[tuple[float, float, float]]:
     """Localize images on a map: error and deviation (m) of the place, squared error of the pose."""
-    tracker = Tracker(Localizer(_believed(_READOUT), NodeConfig()))
+    tracker = Tracker(Localizer(believed(_CAMERA), NodeConfig()))
     seen, context = film.see(true, rng, 100), FrameContext(error_modes=modes)
     for image, stamp in enumerate(film.stamps.tolist()):
         of = seen.images == image

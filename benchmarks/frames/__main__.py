@@ -17,16 +17,12 @@ import argparse
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any
-
-import yaml
 
 from benchmarks.experiments.results import Table
 from benchmarks.frames import paired
 from benchmarks.frames.compared import compare, totals, totals_line, write
-from benchmarks.frames.conditions import BENCHES, Condition, conditions
+from benchmarks.frames.conditions import BENCHES, conditions
 from benchmarks.frames.judged import Judged, judge
 from benchmarks.frames.timed import gate, times
 
@@ -54,9 +50,6 @@ def _parser() -> argparse.ArgumentParser:
                      help="conditions with all these parts in their names")  # fmt: skip
     run.add_argument("--frames", type=int, default=40, metavar="N", help="of a condition (40)")
     run.add_argument("--seed", type=int, default=1, metavar="N", help="(1)")
-    run.add_argument("--set", nargs="+", default=(), metavar="NAME:=VALUE", dest="settings",
-                     help="settings of the localizer, velocity_prior.angular:=0.5")  # fmt: skip
-    run.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (1)")
     run.set_defaults(command=_run)
     against = commands.add_parser("compare", help="two runs, condition by condition")
     against.add_argument("before", type=Path, metavar="BEFORE.npz")
@@ -74,21 +67,17 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(options: argparse.Namespace) -> int:
-    wanted = [one for one in conditions() if one.bench in options.bench and _has(one, options.only)]
+    wanted = [
+        one for one in conditions()
+        if one.bench in options.bench and set(options.only) <= set(one.name.split("/"))
+    ]  # fmt: skip
     if not wanted:
         sys.stderr.write(f"no condition has {' and '.join(options.only)} in its name\n")
         return 2
-    try:
-        settings = dict(_setting(text) for text in options.settings)
-    except ValueError as error:
-        sys.stderr.write(f"{error}\n")
-        return 2
-    each = [(one, options.frames, options.seed, settings) for one in wanted]
     judged: dict[str, Judged] = {}
     width = max(len(one.name) for one in wanted)
-    pool = ProcessPoolExecutor(options.jobs) if options.jobs > 1 else None
-    found = (pool.map if pool else map)(_judge, each)
-    for condition, one in zip(wanted, found, strict=True):
+    for condition in wanted:
+        one = judge(condition, options.frames, options.seed, {})
         if not judged or wanted[len(judged) - 1].bench != condition.bench:
             sys.stderr.write(f"{totals_line(condition.bench, None, width)}\n")
             if judged:  # who stops the run keeps the benches that are done
@@ -99,8 +88,6 @@ def _run(options: argparse.Namespace) -> int:
         said = ", ".join(f"{count} {reason}" for reason, count in reasons)
         row = totals({name: one})["all"]
         sys.stderr.write(f"{totals_line(condition.name, row, width)}  {said}\n")
-    if pool:
-        pool.shutdown()
     write(options.out, judged)
     rows = [
         (bench, *(f"{total[name]:.3g}" for name in _TOGETHER))
@@ -108,22 +95,6 @@ def _run(options: argparse.Namespace) -> int:
     ]
     sys.stdout.write(f"{Table(('', *_TOGETHER.values()), rows).text()}\n")
     return 0
-
-
-def _judge(work: tuple[Condition, int, int, dict[str, Any]]) -> Judged:
-    return judge(*work)
-
-
-def _has(condition: Condition, words: Sequence[str]) -> bool:
-    parts = condition.name.split("/")
-    return all(word in parts for word in words)
-
-
-def _setting(text: str) -> tuple[str, Any]:
-    name, assigned, value = text.partition(":=")
-    if not assigned:
-        raise ValueError(f"settings are NAME:=VALUE, got {text!r}")
-    return name, yaml.safe_load(value)
 
 
 if __name__ == "__main__":

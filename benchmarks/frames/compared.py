@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Two versions on the same frames: what is certainly better or worse, and a picture."""
+"""Two versions on the same frames: what is certainly better or worse."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Change:
 
     before: float
     after: float
-    low: float  # of a share: Wilson's interval of the second version; of an error: of the ratio
+    low: float  # interval of the ratio of an error; NaN of a share
     high: float
     sign: int
 
@@ -135,8 +135,7 @@ def _share(
     each = np.bincount(recording[both].astype(np.int64), gain) if both.any() else np.zeros(1)
     more, fewer = int(np.sum(each > 0.0)), int(np.sum(each < 0.0))
     certain = more + fewer > 0 and binomtest(more, more + fewer).pvalue < _CHANCE
-    low, high = wilson(after[0][after[1]])
-    return Change(shares[0], shares[1], low, high, int(np.sign(more - fewer)) * certain)
+    return Change(*shares, np.nan, np.nan, int(np.sign(more - fewer)) * certain)
 
 
 def _error(before: Array, after: Array, recording: Array) -> Change:
@@ -153,12 +152,6 @@ def _error(before: Array, after: Array, recording: Array) -> Change:
     return Change(float(np.median(before)), float(np.median(after)), low, high, sign)
 
 
-def wilson(hits: BoolArray) -> tuple[float, float]:
-    """95 % interval of a share."""
-    interval = binomtest(int(np.sum(hits)), len(hits)).proportion_ci(method="wilson")
-    return float(interval.low), float(interval.high)
-
-
 def _line(figures: Mapping[str, Change], every: bool) -> str:
     marks = {-1: " WORSE", 0: "", 1: " better"}
     parts = []
@@ -166,10 +159,7 @@ def _line(figures: Mapping[str, Change], every: bool) -> str:
         if not (every or change.sign):
             continue
         if name in _SHARES:
-            text = (
-                f"{100 * change.before:.0f} -> {100 * change.after:.0f} % "
-                f"[{100 * change.low:.0f}, {100 * change.high:.0f}]"
-            )
+            text = f"{100 * change.before:.0f} -> {100 * change.after:.0f} %"
         elif name == "ms":
             text = f"{change.before:.2f} -> {change.after:.2f}"
         else:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ import rs_localizer as rsl
 from benchmarks.frames.conditions import EXACT, Condition
 from benchmarks.frames.generated import Frame, Gyroscope, calibrated, generate
 from benchmarks.independent.rotations import Array, logarithm
+from rs_localizer.config import CalibrationErrors
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
 from rs_localizer.solvers.table import find_solver
 
@@ -86,8 +87,9 @@ def judge(condition: Condition, frames: int, seed: int, settings: Mapping[str, A
     own.setdefault("inlier_threshold", max(2.0, 2.0 * condition.noise))
     # Keypoints that are off together are like a principal point that is off.
     together = condition.points.shift or any(condition.points.alike)
-    exact = condition.calibration == EXACT and not together
-    config = configured(rsl.LocalizerConfig(), own, exact)
+    if condition.calibration == EXACT and not together:
+        own.setdefault("calibration", CalibrationErrors(0.0, 0.0, 0.0, 0.0))
+    config = rsl.LocalizerConfig(**own)
     variants = 1 if condition.calibration == EXACT else len(_DIRECTIONS)
     localizers = [rsl.Localizer(camera_of(condition, k), config) for k in range(variants)]
     # A global shutter has no velocities, and is not tracked.
@@ -142,32 +144,6 @@ def camera_of(condition: Condition, variant: int) -> rsl.Camera:
         readout_time=true.readout_time if off.readout_time is None else off.readout_time,
         scan_direction=str(off.scan or true.scan),
     )
-
-
-def configured(config: Any, settings: Mapping[str, Any], exact: bool) -> Any:
-    """A configuration with settings by dotted name.
-
-    Args:
-        exact: the calibration has no errors, and versions that know how well calibrations are
-            known are told so.
-
-    Raises:
-        ValueError: a name is no setting.
-    """
-    if exact and hasattr(config, "calibration"):
-        none = {f"calibration.{item.name}": 0.0 for item in fields(config.calibration)}
-        settings = none | dict(settings)
-    for name, value in settings.items():
-        config = _with(config, name, value)
-    return config
-
-
-def _with(config: Any, name: str, value: Any) -> Any:
-    own, _, inner = name.partition(".")
-    if not is_dataclass(config) or own not in {item.name for item in fields(config)}:
-        raise ValueError(f"{name} is not a setting of the localizer")
-    changed = _with(getattr(config, own), inner, value) if inner else value
-    return replace(config, **{own: changed})  # type: ignore[type-var]
 
 
 # ns; and a delay (s), scales and a mount (rad) that are known.

@@ -18,7 +18,6 @@ from benchmarks.independent.scenes import visible
 
 _DEPTHS = (1.5, 5.0)  # m
 _WALL_DISTANCE, _TILT = 2.5, math.radians(20.0)
-_BOARD_DISTANCE, _BOARD_SIZE = 1.0, 0.5  # m
 _MARGIN = 12.0  # px
 
 
@@ -27,7 +26,6 @@ class Scene(StrEnum):
 
     RICH = "rich"  # points 1.5 to 5 m before each camera
     WALL = "wall"  # 2.5 m before the body, tilted
-    BOARD = "board"  # 0.5 m wide, 1 m before the body, tilted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,10 +93,6 @@ def views(
         else:
             depth = rng.uniform(*_DEPTHS, pixels.shape[:2])
         body = centre + depth[..., None] * rays
-        if scene is Scene.BOARD:
-            flat = _BOARD_SIZE * (pixels / size - 0.5)
-            body = np.einsum("fij,fnj->fni", tilt[:, :, :2], flat)
-            body[..., 2] += _BOARD_DISTANCE
         points = position[:, None] + np.einsum("fij,fnj->fni", rotation, body)
         exact = mounted.seen(motions, which, begin, points)
         result[name] = Views(points, exact, visible(mounted.camera, exact))

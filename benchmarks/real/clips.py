@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from rs_localizer.core.arrays import IntArray
-from rs_localizer.core.camera import Camera, DistortionModel
+from rs_localizer.core.camera import Camera
 from rs_localizer.io.video import Video
 from rs_localizer.markers.boards import find_chessboard
 from rs_localizer.markers.prints import Chessboard
@@ -100,9 +100,9 @@ def _detect(path: Path, board: Chessboard, file: Path) -> None:
     np.savez(file, times=seconds[shown], pixels=corners, size=size)
 
 
-def opencv_lens(clip: Clip, images: list[ImagePoints] | None = None) -> Camera:
+def opencv_lens(clip: Clip) -> Camera:
     """The lens that ``cv2.calibrateCamera`` finds on some of the images."""
-    chosen = clip.images if images is None else images
+    chosen = clip.images
     picks = np.unique(np.linspace(0, len(chosen) - 1, _CALIBRATION_IMAGES).astype(int))
     points = [np.asarray(chosen[k].points, np.float32) for k in picks]
     pixels = [np.asarray(chosen[k].pixels, np.float32) for k in picks]
@@ -118,46 +118,34 @@ class Shutter:
     deviation: float  # s
     scan_direction: str
     verdict: str  # in a few words
-    lens: Camera | None
 
 
 def shutter_of(clip: Clip, cache: Path) -> Shutter:
     """The package's own calibration of lens and readout time, cached: it takes a minute."""
     file = cache / f"{clip.name}_calibration.json"
     if not file.exists():
-        file.write_text(json.dumps(_calibrated(clip, clip.images)), encoding="utf-8")
+        file.write_text(json.dumps(_calibrated(clip)), encoding="utf-8")
     found = json.loads(file.read_text(encoding="utf-8"))
-    lens = found["K"] and Camera(
-        *clip.size,
-        K=np.array(found["K"]),
-        D=np.array(found["D"]),
-        distortion_model=DistortionModel(found["distortion_model"]),
-    )
     known = found["readout_time"] > 1e-3
     return Shutter(
         found["readout_time"] if known else _PHONE,
         0.0 if known else _PHONE_DEVIATION,
         found["direction"] if known else "top_to_bottom",
         found["verdict"],
-        lens or None,
     )
 
 
-def _calibrated(clip: Clip, images: list[ImagePoints]) -> dict[str, object]:
-    unknown = {"readout_time": 0.0, "direction": "", "K": None, "D": None}
+def _calibrated(clip: Clip) -> dict[str, object]:
     try:
-        found = calibrate(first_lens(clip.size, images), images, intrinsics=True)
+        found = calibrate(first_lens(clip.size, clip.images), clip.images, intrinsics=True)
     except ValueError as error:
-        return {**unknown, "verdict": f"none: {error}"}
+        return {"readout_time": 0.0, "direction": "", "verdict": f"none: {error}"}
     value = f"{1e3 * found.readout_time:+.2f} +- {1e3 * found.deviation:.2f} ms"
-    refusal, camera = verdict.refusal(found), found.fit.camera
+    refusal = verdict.refusal(found)
     return {
         "readout_time": 0.0 if refusal else verdict.readout_time(found),
         "direction": str(verdict.scan_direction(found)),
         "verdict": f"refused, {value}" if refusal else value,
-        "K": camera.K.tolist(),
-        "D": camera.D.tolist(),
-        "distortion_model": str(camera.distortion_model),
     }
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from benchmarks.aided import believed
 from benchmarks.experiments.results import Table, rounded
 from benchmarks.independent.cameras import Camera as TrueCamera
 from benchmarks.real.peers import PEERS
@@ -154,11 +155,7 @@ def simulated(
         shown = pixels[kept] + noise * rng.normal(size=(len(kept), 2))
         middle = round(1e9 * (stamp + 0.5 * camera.readout_time)) + EPOCH_NS
         frames.append(Frame(middle, points[chosen[kept]], shown))
-    own = Camera(
-        camera.width, camera.height, K=camera.matrix, D=np.array(camera.distortion),
-        readout_time=camera.readout_time, scan_direction=str(camera.scan),
-    )  # fmt: skip
-    return Recording(name, own, frames)
+    return Recording(name, believed(camera), frames)
 
 
 @dataclass(frozen=True, slots=True)

@@ -126,4 +126,3 @@ def test_the_commands(tmp_path, capsys):
     assert "WORSE" not in out
     assert name in out
     assert command.main(["run", "--out", str(table), "--only", "nothing"]) == 2
-    assert command.main(["run", "--out", str(table), "--set", "seed=1"]) == 2
