@@ -44,7 +44,7 @@ def run(context: Context) -> Result:
     """
     by_count = {
         count: sweep(
-            context, "deg_per_frame", _SPEEDS,
+            context, _SPEEDS,
             lambda speed: Setting(speed, _TRANSLATION * speed),
             [replace(method, iterations=count) for method in _METHODS],
         )

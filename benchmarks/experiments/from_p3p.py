@@ -28,7 +28,7 @@ def run(context: Context) -> Result:
 
     def curves(iterations: int, noise: float) -> Curves:
         return sweep(
-            context, "deg_per_frame", _SPEEDS,
+            context, _SPEEDS,
             lambda speed: Setting(speed, _TRANSLATION * speed, noise),
             [replace(method, iterations=iterations) for method in _METHODS],
             lambda trials, _: m.best_triplet(trials).rotation,

@@ -26,7 +26,7 @@ def run(context: Context) -> Result:
 
     def curves(drifting: bool) -> Curves:
         return sweep(
-            context, "initial_error_deg", _OFFSETS,
+            context, _OFFSETS,
             lambda _: Setting(_SPEED, _TRANSLATION, drifting=drifting), _METHODS,
             lambda trials, offset: random_rotations(len(trials), context.seed, offset)
             @ trials.truth.rotation,

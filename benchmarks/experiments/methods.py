@@ -43,13 +43,10 @@ class Method:
     refined: bool = False
 
 
-P3P = Method("p3p", "p3p", "p3p")
-R6P = Method("r6p", "r6p", "r6p")
-VC_WT = Method("r6p_vc_wt", "r6p_vc_wt", "r6p_vc_wt")
-VCT_W = Method("r6p_vct_w", "r6p_vct_w", "r6p_vct_w")
-VCT_WT = Method("r6p_vct_wt", "r6p_vct_wt", "r6p_vct_wt")
-VCWT = Method("r6p_vcwt", "r6p_vcwt", "r6p_vcwt")
-R9P = Method("r9p", "r9p", "r9p")
+PAPERS = P3P, R6P, VC_WT, VCT_W, VCT_WT, VCWT, R9P = tuple(
+    Method(name, name, name)
+    for name in ("p3p", "r6p", "r6p_vc_wt", "r6p_vct_w", "r6p_vct_wt", "r6p_vcwt", "r9p")
+)
 VCWT_OURS = Method("r6p_vcwt_relinearized", "r6p_vcwt, relinearized", "r6p_vcwt",
                    as_published=False)  # fmt: skip
 R9P_OURS = Method("r9p_trace_fixed", "r9p, trace fixed", "r9p", as_published=False)
@@ -57,7 +54,6 @@ JOINT = Method("joint", "joint", "joint", as_published=False)
 REFINED = Method("refined", f"ours, refined on {POINTS} points", "r6p_vcwt", as_published=False,
                  refined=True)  # fmt: skip
 
-PAPERS = (P3P, R6P, VC_WT, VCT_W, VCT_WT, VCWT, R9P)
 TWO_STEP = (VC_WT, VCT_W, VCT_WT)
 OURS = (VCWT_OURS, R9P_OURS, JOINT, REFINED)
 ALL = PAPERS + OURS
@@ -94,10 +90,8 @@ def best_triplet(trials: Trials) -> Motions:
 
 def states(motions: Motions) -> Array:
     """Model B states (h,24) of the reprojection kernels: ``omega = -w``, ``v = w x C - t``."""
-    velocity = np.cross(motions.w, motions.translation) - motions.t
-    rotation = motions.rotation.reshape(-1, 9)
-    still = np.zeros((len(rotation), 6))
-    return np.hstack([rotation, motions.translation, -motions.w, velocity, still])
+    parts = motions.rotation.reshape(-1, 9), motions.translation, motions.w, motions.t
+    return _states(np.hstack(parts))
 
 
 def _models(method: Method, trials: Trials, initial: Array) -> Array:
@@ -161,14 +155,9 @@ def _refined(models: Array, trials: Trials, threshold: float) -> Motions:
         if np.isnan(models[i, 0]):
             continue
         state, cost = optimize(
-            _states(models[i : i + 1]),
-            np.zeros(1),
-            frame.packed,
-            8.0 * threshold,
-            threshold,
-            prior,
-            noise,
-        )
+            _states(models[i : i + 1]), np.zeros(1), frame.packed, 8.0 * threshold, threshold,
+            prior, noise,
+        )  # fmt: skip
         if np.isfinite(cost):
             near = frame.only(np.flatnonzero(frame.squared_errors(state) < 4.0 * threshold**2))
             found[i] = refine(near.packed, state, (1e6, 0.0), prior, noise, 2, 10, 1e-6)[0]

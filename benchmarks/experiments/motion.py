@@ -35,7 +35,7 @@ def run(context: Context) -> Result:
 
     def curves(noise: float, drifting: bool = False) -> Curves:
         return sweep(
-            context, "deg_per_frame", _SPEEDS,
+            context, _SPEEDS,
             lambda speed: Setting(speed, _TRANSLATION * speed, noise, drifting), m.ALL,
         )  # fmt: skip
 

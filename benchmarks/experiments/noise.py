@@ -29,9 +29,7 @@ def run(context: Context) -> Result:
 
     Everything else is as under ``motion``; the bound is that of Cramer and Rao.
     """
-    curves = sweep(
-        context, "noise_px", _NOISES, lambda noise: Setting(_SPEED, _TRANSLATION, noise), m.ALL
-    )
+    curves = sweep(context, _NOISES, lambda noise: Setting(_SPEED, _TRANSLATION, noise), m.ALL)
     trials = draw_trials(context.trials, context.seed, Setting(_SPEED, _TRANSLATION, 1.0))
     bounds = {n: _median_bound(trials, n, context.seed) for n in (_SIX, POINTS)}
     six, fifty = (bound[0] for bound in bounds.values())

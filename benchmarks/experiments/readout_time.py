@@ -41,9 +41,6 @@ _CAMERA = Camera(
 class Trial:
     """One recording."""
 
-    scene: str
-    direction: ScanDirection
-    outliers: float
     truth: float  # s
     found: CameraCalibration
 
@@ -122,7 +119,7 @@ def _trial(motion: RecordedMotion, seconds: float, k: int, seed: int) -> Trial:
     frames = simulate_frames(camera, motion, points, settings, stamps_ns=stamps, seed=k)
     images = [ImagePoints(frame.stamp_ns, frame.points, frame.pixels) for frame in frames]
     found = calibrate(replace(camera, readout_time=0.0), images)
-    return Trial(scene, direction, outliers, truth, found)
+    return Trial(truth, found)
 
 
 def _map(motion: RecordedMotion, scene: str, rng: np.random.Generator) -> Array:

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,14 +29,6 @@ _PART = 50  # models that are scored at once
 _METHODS = (m.P3P, m.R6P, m.VC_WT, m.VCT_W, m.VCT_WT, m.VCWT, m.R9P, m.R9P_OURS)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Sequence:
-    """The images, and which of them are fast."""
-
-    recording: Recording
-    fastest: IntArray  # (12,) places
-
-
 def run(context: Context) -> Result:
     """Plain RANSAC on the bundled *real* phone, its images of 330 points.
 
@@ -45,19 +36,19 @@ def run(context: Context) -> Result:
     rigid body. The rolling-shutter solvers start from the best orientation of P3P's samples; five
     iterations.
     """
-    sequence = _read()
-    frames = sequence.recording.frames
+    recording, fastest = _read()
+    frames = recording.frames
     # Fewer trials leave slow images out, every one of the fastest stays.
     wanted = int(np.clip(len(frames) * context.trials / 1000, _FASTEST, len(frames)))
-    others = np.setdiff1d(np.arange(len(frames)), sequence.fastest)
-    places = np.sort(np.concatenate([sequence.fastest, others[: wanted - _FASTEST]]))
+    others = np.setdiff1d(np.arange(len(frames)), fastest)
+    places = np.sort(np.concatenate([fastest, others[: wanted - _FASTEST]]))
     shares: dict[str, list[tuple[float, ...]]] = {method.name: [] for method in _METHODS}
     for k in context.track(places.tolist(), len(places)):
         rng = np.random.default_rng([context.seed, k])
-        for name, share in inliers(sequence.recording.camera, frames[k], rng, _METHODS).items():
+        for name, share in inliers(recording.camera, frames[k], rng, _METHODS).items():
             shares[name].append(share)
     found = {name: np.array(of) for name, of in shares.items()}
-    fast = np.isin(places, sequence.fastest)
+    fast = np.isin(places, fastest)
     mean = {name: of[fast].mean(axis=0) for name, of in found.items()}
     best = max(mean[x.name][1] for x in (m.R6P, *m.TWO_STEP, m.VCWT))
     return Result(
@@ -132,13 +123,14 @@ def _best(
     return errors, rotation
 
 
-def _read() -> Sequence:
+def _read() -> tuple[Recording, IntArray]:
+    """The images, and the places of the fastest."""
     recording = read_bag(PHONE, build(load_params_file(PHONE / "parameters.yaml")))
     times = 1e-9 * np.array([frame.middle_ns for frame in recording.frames])
     half = 0.5 * recording.camera.readout_time
     rates = Gyroscope.read(PHONE_GYROSCOPE).mean_rate(times - half, times + half)
     order = np.argsort(-np.linalg.norm(rates, axis=1)).astype(np.int64)
-    return Sequence(recording, order[:_FASTEST])
+    return recording, order[:_FASTEST]
 
 
 def _shown(found: Mapping[str, Array], fast: BoolArray) -> str:

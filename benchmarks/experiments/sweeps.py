@@ -41,16 +41,14 @@ def motion_errors(found: Motions, truth: Motions) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curves:
-    """Quartiles of the errors of each method at each place of the sweep."""
+    """Median errors of each method at each place of the sweep."""
 
-    x_name: str
     x: Array  # (m,)
-    quartiles: Mapping[str, Array]  # method -> (m,3,4): 25, 50, 75 %; metrics
+    of: Mapping[str, Array]  # method -> (m,4)
 
     def medians(self, method: Method) -> Array:
         """Medians (m,4) of all metrics."""
-        values: Array = self.quartiles[method.name][:, 1]
-        return values
+        return self.of[method.name]
 
     def moving(self, method: Method) -> Array:
         """The same, but for the first place, where nothing moves."""
@@ -65,15 +63,14 @@ class Curves:
         columns = ("orientation (deg), motion:", *(f"{x:g} {unit}" for x in places))
         nearest = [np.argmin(np.abs(self.x - x)) for x in places]
         rows = [
-            (name, *(rounded(float(values[k, 1, ORIENTATION])) for k in nearest))
-            for name, values in self.quartiles.items()
+            (name, *(rounded(float(values[k, ORIENTATION])) for k in nearest))
+            for name, values in self.of.items()
         ]
         return Table(columns, rows).text()
 
 
 def sweep(
     context: Context,
-    x_name: str,
     x: Sequence[float],
     setting: Callable[[float], Setting],
     methods: Sequence[Method],
@@ -92,13 +89,9 @@ def sweep(
         start = None if initial is None else initial(trials, value)
         for method in methods:
             motions = estimate(method, trials, start, here.noise)
-            found[method.name].append(quartiles(motion_errors(motions, trials.truth)))
-    return Curves(x_name, np.array(x, float), {name: np.array(q) for name, q in found.items()})
-
-
-def quartiles(errors: Array) -> Array:
-    """Quartiles (3,k) of errors (h,k), of which some may be infinite."""
-    return np.asarray(np.percentile(errors, (25.0, 50.0, 75.0), axis=0, method="nearest"))
+            errors = motion_errors(motions, trials.truth)  # some may be infinite
+            found[method.name].append(np.percentile(errors, 50.0, axis=0, method="nearest"))
+    return Curves(np.array(x, float), {name: np.array(of) for name, of in found.items()})
 
 
 def crossing(x: Array, rising: Array, level: Array) -> float:

@@ -22,9 +22,7 @@ _REST = (
 
 def run(context: Context) -> Result:
     """Translation up to 0.3 per frame, 1 px of noise; everything else as under ``motion``."""
-    curves = sweep(
-        context, "per_frame", _SPEEDS, lambda speed: Setting(linear=speed, noise=1.0), m.ALL
-    )
+    curves = sweep(context, _SPEEDS, lambda speed: Setting(linear=speed, noise=1.0), m.ALL)
     places = curves.x >= _FROM - 1e-9
     ratios = []
     for metric in (ORIENTATION, POSITION, T):

@@ -83,7 +83,6 @@ class Setting:
     # instead, the scene moves straight past the turning camera (model A): the camera swings about
     # the scene.
     drifting: bool = False
-    points: int = POINTS
 
 
 # Half of the points that leave the image are seen by no row, which takes the search for their row
@@ -114,7 +113,7 @@ def angles(rotations: Array, others: Array) -> Array:
 def _draw(count: int, rng: np.random.Generator, setting: Setting) -> Trials:
     """Up to ``count`` frames: those that see enough points."""
     view = camera()
-    candidates = _CANDIDATES_PER_POINT * setting.points
+    candidates = _CANDIDATES_PER_POINT * POINTS
     rotation, translation = _looking_at_the_centre(count, rng)
     w = math.radians(setting.angular) * _directions(count, rng)
     velocity = setting.linear * _directions(count, rng)
@@ -131,14 +130,14 @@ def _draw(count: int, rng: np.random.Generator, setting: Setting) -> Trials:
 
     pixels, _ = project_rolling(view, poses_at, points.reshape(-1, 3))
     inside = view.inside(pixels).reshape(count, candidates)
-    kept = np.flatnonzero(inside.sum(axis=1) >= setting.points)
-    seen = np.argsort(~inside, axis=1, kind="stable")[kept, : setting.points]
-    noise = setting.noise * rng.normal(size=(count, setting.points, 2))[kept]
+    kept = np.flatnonzero(inside.sum(axis=1) >= POINTS)
+    seen = np.argsort(~inside, axis=1, kind="stable")[kept, :POINTS]
+    noise = setting.noise * rng.normal(size=(count, POINTS, 2))[kept]
     pixels = (pixels.reshape(count, candidates, 2)[kept[:, None], seen] + noise).reshape(-1, 2)
     return Trials(
         points[kept[:, None], seen],
-        view.rays(pixels).reshape(-1, setting.points, 2),
-        view.row_time(pixels).reshape(-1, setting.points),
+        view.rays(pixels).reshape(-1, POINTS, 2),
+        view.row_time(pixels).reshape(-1, POINTS),
         Motions(rotation[kept], translation[kept], w[kept], t[kept]),
     )
 

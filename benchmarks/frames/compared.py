@@ -135,7 +135,7 @@ def _share(
     each = np.bincount(recording[both].astype(np.int64), gain) if both.any() else np.zeros(1)
     more, fewer = int(np.sum(each > 0.0)), int(np.sum(each < 0.0))
     certain = more + fewer > 0 and binomtest(more, more + fewer).pvalue < _CHANCE
-    return Change(*shares, np.nan, np.nan, int(np.sign(more - fewer)) * certain)
+    return Change(shares[0], shares[1], np.nan, np.nan, int(np.sign(more - fewer)) * certain)
 
 
 def _error(before: Array, after: Array, recording: Array) -> Change:
