@@ -2,16 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The package as ROS, colcon and pip see it: description, versions, content, import rule."""
 
-import os
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 import tomllib
-import zipfile
-from collections.abc import Callable, Iterator
-from configparser import ConfigParser
+from collections.abc import Callable
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -54,60 +50,6 @@ def test_versions_agree():
     assert f'\n  version: "{version}"' in recipe
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory) -> Iterator[zipfile.ZipFile]:
-    """Built from a copy of the sources."""
-    directory = tmp_path_factory.mktemp("wheel")
-    source, result = directory / "source", directory / "result"
-    result.mkdir()
-    for name in "rs_localizer config launch resource".split():
-        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in "package.xml setup.py setup.cfg pyproject.toml LICENSE".split():
-        shutil.copy(ROOT / name, source)
-    code = f"import setuptools.build_meta as b; b.build_wheel({str(result)!r})"
-    inherited = {k: v for k, v in os.environ.items() if k != "AMENT_PREFIX_PATH"}
-    made = subprocess.run(
-        [sys.executable, "-c", code], cwd=source, env=inherited, text=True, capture_output=True,
-        check=False,
-    )  # fmt: skip
-    assert made.returncode == 0, made.stderr
-    with zipfile.ZipFile(next(result.iterdir())) as archive:
-        yield archive
-
-
-def test_wheel_holds_every_file_of_the_package(wheel):
-    paths = [p for p in (ROOT / "rs_localizer").rglob("*") if "__pycache__" not in p.parts]
-    files = {p.relative_to(ROOT).as_posix() for p in paths if p.is_file()}
-    assert "rs_localizer/py.typed" in files
-    # What only the build needs is in the sdist alone, and objects of a checkout are in neither.
-    native, tools = "rs_localizer/native/", ("bitcode.py", "build.py", "jit.py", "sources.py")
-    files -= {f"{native}{name}" for name in tools}
-    files = {name for name in files if not re.fullmatch(rf"{native}.*\.(c|h|cpp|json|so)", name)}
-    assert files - set(wheel.namelist()) == set()
-    modules = {name for name in wheel.namelist() if name.startswith(native)} - files
-    assert all(re.fullmatch(rf"{native}_(cpu|kernels_\w+)\.abi3\.so", name) for name in modules)
-    assert len(modules) >= 2
-
-
-def test_wheel_puts_shared_files_where_ros_looks(wheel):
-    shared = {name.partition(".data/data/share/")[2] for name in wheel.namelist()} - {""}
-    expected = {"ament_index/resource_index/packages/rs_localizer", "rs_localizer/package.xml"}
-    expected |= {f"rs_localizer/config/{path.name}" for path in (ROOT / "config").glob("*")}
-    expected |= {f"rs_localizer/launch/{path.name}" for path in (ROOT / "launch").glob("*.py")}
-    assert shared == expected
-
-
-def test_declared_commands_can_be_imported(wheel):
-    declared = ConfigParser()
-    path = next(n for n in wheel.namelist() if n.endswith(".dist-info/entry_points.txt"))
-    declared.read_string(wheel.read(path).decode())
-    assert declared.sections() == ["console_scripts"]
-    names = "doctor localizer marker_detector feature_detector rs_localizer"
-    assert set(declared["console_scripts"]) == set(names.split())
-    for name, value in declared["console_scripts"].items():
-        assert callable(EntryPoint(name, value, "console_scripts").load()), value
-
-
 DOCKERFILE = ROOT / "packaging" / "docker" / "Dockerfile"
 # conda's names, where they differ from pip's.
 CONDA = {"opencv-python-headless": "py-opencv", "PyYAML": "pyyaml"}
@@ -127,6 +69,23 @@ def setup_says(monkeypatch) -> Callable[[Path], dict[str, Any]]:
         return said
 
     return says
+
+
+def test_shared_files_lie_where_ros_looks_and_commands_can_be_imported(setup_says):
+    """What of it a wheel has, ``.ci/check_wheel.py`` and the smoke tests of CI see."""
+    said = setup_says(ROOT)
+    shared = {
+        f"{folder}/{Path(file).name}" for folder, files in said["data_files"] for file in files
+    }
+    expected = {"ament_index/resource_index/packages/rs_localizer", "rs_localizer/package.xml"}
+    expected |= {f"rs_localizer/config/{path.name}" for path in (ROOT / "config").glob("*")}
+    expected |= {f"rs_localizer/launch/{path.name}" for path in (ROOT / "launch").glob("*.py")}
+    assert shared == {f"share/{name}" for name in expected}
+    declared = dict(line.split(" = ") for line in said["entry_points"]["console_scripts"])
+    names = "doctor localizer marker_detector feature_detector rs_localizer"
+    assert set(declared) == set(names.split())
+    for name, value in declared.items():
+        assert callable(EntryPoint(name, value, "console_scripts").load()), value
 
 
 def test_bounds_are_the_same_everywhere(setup_says):

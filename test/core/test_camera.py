@@ -80,22 +80,6 @@ def test_projecting_undoes_rays_also_with_binning_and_roi(model, D):
 
 
 @pytest.mark.parametrize(("model", "D"), LENSES)
-def test_pixel_jacobian_is_the_finite_difference_of_projecting(model, D):
-    lens = camera(D=D, distortion_model=model, binning=(2, 1))
-    rays = lens.rays(pixels(20) / (2, 1))
-    jacobian = lens.pixel_jacobian(rays)
-    h = 1e-5
-    for k in range(2):
-        step = h * np.eye(2)[k]
-        ahead, behind = (
-            lens.project(np.column_stack([rays + s, np.ones(len(rays))])) for s in (step, -step)
-        )
-        np.testing.assert_allclose(
-            jacobian[:, :, k], (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-3
-        )
-
-
-@pytest.mark.parametrize(("model", "D"), LENSES)
 @pytest.mark.parametrize("part", [{}, PART])
 def test_kernels_of_many_pixels_give_the_same(model, D, part):
     """203: some blocks of lanes, and a part of one."""

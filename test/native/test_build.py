@@ -88,20 +88,6 @@ def compiled(to, level, *modules, path=sources.PACKAGE.parent, **environment):
     return to
 
 
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="compiles for x86-64")
-def test_the_same_bytes_come_from_another_folder_and_seed(tmp_path):
-    made, modules = [], ("rs_localizer.core.bearings", "rs_localizer.core.so3")
-    for folder, seed in ((tmp_path / "one", "1"), (tmp_path / "a" / "longer" / "path", "77")):
-        package, without = folder / "rs_localizer", shutil.ignore_patterns("*.so")
-        shutil.copytree(sources.PACKAGE, package, ignore=without)
-        to = tmp_path / f"made_{seed}"
-        made.append(compiled(to, "v2", *modules, path=folder, PYTHONHASHSEED=seed))
-    one, other = made
-    for name in ("kernels.o", "table.c"):
-        assert (one / name).read_bytes() == (other / name).read_bytes()
-    assert str(tmp_path).encode() not in (one / "kernels.o").read_bytes()
-
-
 GIVING = """
 import numpy as np
 from rs_localizer.core.arrays import Array, Array2
