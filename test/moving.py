@@ -3,12 +3,14 @@
 """Images of cameras that move while their rows are exposed, by the independent projector."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
+from benchmarks.aided import believed
 from benchmarks.independent.cameras import Camera
 
 Pose = Callable[[np.ndarray], tuple[Rotation, np.ndarray]]
@@ -17,11 +19,7 @@ Pose = Callable[[np.ndarray], tuple[Rotation, np.ndarray]]
 
 def camera_of(true: Camera, **changes: Any) -> rsl.Camera:
     """The camera as it is calibrated, or as these changes have it."""
-    values: dict[str, Any] = {
-        "width": true.width, "height": true.height, "K": true.matrix, "D": true.distortion,
-        "readout_time": true.readout_time, "scan_direction": str(true.scan),
-    }  # fmt: skip
-    return rsl.Camera(**(values | changes))
+    return replace(believed(true), **changes)
 
 
 def shown(true: Camera, pose: Pose, points: np.ndarray) -> np.ndarray:

@@ -274,10 +274,6 @@ def test_what_users_mistake_is_named():
     assert "inlier_threshold=3.0" in repr(localizer)
     of_a_node = rsl.Localizer(camera(), NodeConfig(inlier_threshold=3.0, readout_time=0.01))
     assert repr(of_a_node) == repr(localizer)
-    result = localizer.localize(points, pixels)
-    for tau in (240.0, -0.6, np.nan):
-        with pytest.raises(ValueError, match=r"tau must lie between -0\.5, the first row"):
-            result.at(tau)
     degrees = rsl.Prior(angular_velocity=(0.0, 30.0, 0.0), angular_velocity_deviation=0.1)
     with pytest.raises(ValueError, match="is it in rad/s, or in degrees"):
         localizer.localize(points, pixels, prior=degrees)
@@ -287,8 +283,6 @@ def test_what_users_mistake_is_named():
     assert normalized.reason == rsl.Reason.DEGENERATE
     assert "normalized coordinates" in normalized.detail
     failure = localizer.localize(points[:5], pixels[:5])
-    with pytest.raises(AttributeError, match=r"no rotation, because there is no pose .*if result"):
-        failure.rotation  # noqa: B018
     assert copy.deepcopy(failure) == failure
 
 

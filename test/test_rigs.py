@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
+from benchmarks.aided import believed
 from benchmarks.independent.cameras import Camera as TrueCamera
 from benchmarks.independent.cameras import Scan
 from benchmarks.independent.motions import hand, steady
@@ -39,13 +40,7 @@ def pair(rotation=TURNED, translation=BESIDE, start=0.0, **camera):
 
 
 def rig_of(mounted, **more):
-    cameras = {
-        name: rsl.Camera(
-            each.camera.width, each.camera.height, each.camera.matrix, each.camera.distortion,
-            readout_time=each.camera.readout_time, scan_direction=str(each.camera.scan),
-        )
-        for name, each in mounted.items()
-    }  # fmt: skip
+    cameras = {name: believed(each.camera) for name, each in mounted.items()}
     places = {name: (each.rotation, each.translation) for name, each in mounted.items()}
     return rsl.Rig(cameras, places, **more)
 

@@ -3,14 +3,6 @@
 """What comes with the package can be read and is what its attribution says."""
 
 from rs_localizer import data
-from rs_localizer.io.trajectories import read_tum, split_at_gaps
-
-
-def test_hand_motion():
-    trajectory = read_tum(data.path(data.HAND_MOTION))
-    assert len(trajectory) == 16999
-    assert trajectory.stamps_ns[0] == 1_520_531_467_575_280_000
-    assert len(split_at_gaps(trajectory)) == 14
 
 
 def test_everything_is_attributed_and_small():

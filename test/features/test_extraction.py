@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.features.extraction import FeatureExtractor, choose_balanced
+from rs_localizer.tools.simulation.walls import collage
 
 # OpenCV 5 has AKAZE in its contrib modules only.
 KINDS = [
@@ -19,31 +20,9 @@ KINDS = [
 
 
 @cache
-def texture() -> Any:
-    """Discs, boxes and letters of all sizes (1200, 1600)."""
-    rng = np.random.default_rng(7)
-    picture = np.full((1200, 1600), 128, np.uint8)
-    for size in np.sort(np.exp(rng.uniform(np.log(8), np.log(300), 500)))[::-1]:
-        x, y = (int(value) for value in rng.uniform((0, 0), (1600, 1200)))
-        grey, kind = int(rng.integers(10, 246)), rng.integers(3)
-        if kind == 0:
-            box = cv2.boxPoints(((x, y), (size, 0.6 * size), float(rng.uniform(0, 90))))
-            cv2.fillPoly(picture, [np.rint(box).astype(np.int32)], grey, cv2.LINE_AA)
-        elif kind == 1:
-            cv2.circle(picture, (x, y), int(size / 2), grey, -1, cv2.LINE_AA)
-        else:
-            letter = chr(int(rng.integers(65, 91)))
-            cv2.putText(picture, letter, (x, y), 0, size / 22, grey, int(size / 9), cv2.LINE_AA)
-    return cv2.GaussianBlur(picture, (0, 0), 1.0)
-
-
-@cache
 def look() -> Any:
-    """An image (300,400) of the middle of the texture, with noise."""
-    part = texture()[375:825, 500:1100].astype(np.float32)
-    image = cv2.resize(part, (400, 300), interpolation=cv2.INTER_AREA)
-    noise = np.random.default_rng(3).normal(0.0, 1.0, image.shape)
-    return np.clip(np.rint(image + noise), 0, 255).astype(np.uint8)
+    """A picture (300,400) of discs, boxes and letters of all sizes, with noise."""
+    return collage(400, 300, np.random.default_rng(7))
 
 
 @cache

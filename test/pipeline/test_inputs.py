@@ -13,29 +13,17 @@ import rs_localizer
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.reasons import Reason
 from rs_localizer.io.bags import BagError, BagReader
-from rs_localizer.io.topics import GIVEN_POSES
 from rs_localizer.offline.replay import NO_FRAMES, camera_topics, find_rig_topics, find_topics
 from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.inputs import INPUTS, Role
 from rs_localizer.pipeline.refusal import Refusal
 
-ROOT = Path(__file__).parents[2]
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
 
 
 def bag(**topics: str) -> Any:
     connections = [SimpleNamespace(topic=f"/{it}", msgtype=kind) for it, kind in topics.items()]
     return BagReader(Path("bag"), SimpleNamespace(connections=connections))
-
-
-def test_the_page_of_the_node_has_every_input_with_its_type():
-    rows = re.findall(
-        r"^\| in \| `([\w/~]+)`.*? \| (.*?) \|", (ROOT / "docs" / "node.md").read_text(), re.M
-    )
-    types = {name: item.type for name, item in INPUTS.items()} | GIVEN_POSES
-    assert {name for name, _ in rows} == set(types)
-    for name, kind in rows:
-        assert kind.startswith(types[name].replace("/msg/", "/"))
 
 
 @pytest.mark.parametrize("name", INPUTS)
