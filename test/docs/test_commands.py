@@ -61,11 +61,18 @@ def test_commands_and_options_exist(page, words):
 
 
 @pytest.mark.parametrize("page", pages.NAMES)
-def test_files_of_the_repository_in_commands_exist(page):
-    known = ("rs_localizer/", "examples/", "config/", "packaging/", "benchmarks/")
-    words = {word for line in pages.shell(page) for word in line.split() if word.startswith(known)}
-    missing = {word for word in words if not (pages.ROOT / word).exists() and "NAME" not in word}
-    assert missing == set()
+def test_files_commands_and_targets_of_make_that_a_page_names_exist(page):
+    known, lines = (
+        ("rs_localizer/", "examples/", "config/", "packaging/", "benchmarks/"),
+        pages.shell(page),
+    )
+    words = {word for line in lines for word in line.split() if word.startswith(known)}
+    assert {w for w in words if not (pages.ROOT / w).exists() and "NAME" not in w} == set()
+    said = pages.names_in(pages.prose(page))
+    called = {words.split()[1] for words in said if re.match(r"rs_localizer [a-z]", words)}
+    assert called <= {name.split()[0] for name in COMMANDS}
+    targets = re.findall(r"^(\w+):", pages.text("Makefile"), re.MULTILINE)
+    assert {line.split()[1] for line in lines if re.match(r"make \w", line)} <= set(targets)
 
 
 @pytest.mark.parametrize(("page", "module", "words"), _MODULES)
@@ -89,27 +96,7 @@ def test_launch_files_exist(page, line):
         return
     code = (pages.ROOT / "launch" / file).read_text()
     code += (pages.ROOT / "rs_localizer" / "ros" / "launching.py").read_text()
-    known = {
-        *settings(),
-        *settings(DetectorConfig),
-        *settings(FeatureConfig),
-        *INPUTS,
-        *GIVEN_POSES,
-    }
-    known |= set(re.findall(r"\"(\w+)\"", code))
+    known = {*settings(), *settings(DetectorConfig), *settings(FeatureConfig), *INPUTS}
+    known |= {*GIVEN_POSES, *re.findall(r"\"(\w+)\"", code)}
     given = {word.partition(":=")[0] for word in arguments if not word.startswith("--")}
     assert given <= known, page
-
-
-@pytest.mark.parametrize("page", pages.NAMES)
-def test_commands_in_sentences_exist(page):
-    said = pages.names_in(pages.prose(page))
-    called = {words.split()[1] for words in said if re.match(r"rs_localizer [a-z]", words)}
-    assert called <= {name.split()[0] for name in COMMANDS}
-
-
-@pytest.mark.parametrize("page", pages.NAMES)
-def test_targets_of_make_exist(page):
-    known = re.findall(r"^(\w+):", (pages.ROOT / "Makefile").read_text(), re.MULTILINE)
-    used = [line.split()[1] for line in pages.shell(page) if re.match(r"make \w", line)]
-    assert set(used) <= set(known)

@@ -37,7 +37,6 @@ FLIGHT = (
     "--noise", "0.3", "--outliers", "0.1", "--imu", "--vibration", "0.1", "60",
 )  # fmt: skip
 
-Item = tuple[str, int, Any]
 Change = Callable[[Any, float], Iterable[Any]]
 """A message of the IMU and when it comes (s since the first frame): what comes instead."""
 
@@ -46,14 +45,20 @@ class Flight:
     """A recording in memory."""
 
     def __init__(self, path: Path) -> None:
-        self.truth = read_motions(path, "/truth/pose", "/truth/twist").poses
+        truth = read_motions(path, "/truth/pose", "/truth/twist").poses
+        places = zip(truth.positions, truth.quaternions, strict=True)
+        self.truth = dict(zip(truth.stamps_ns.tolist(), places, strict=True))
         with open_bag(path) as bag:
             self.items = list(bag.messages(["/imu", "/camera_info", "/correspondences"]))
             (self.mounting,) = [m for _, _, m in bag.messages(["/tf_static"])]
-        self.start_ns = next(ns for topic, ns, _ in self.items if topic == "/correspondences")
+        stamps = [ns for topic, ns, _ in self.items if topic == "/correspondences"]
+        self.start_ns, self.count = stamps[0], len(stamps)
 
-    def since_start(self, recorded_ns: int) -> float:
-        return (recorded_ns - self.start_ns) * 1e-9
+    def changed(self, change: Change) -> Iterable[tuple[str, int, Any]]:
+        for topic, ns, message in self.items:
+            seconds = (ns - self.start_ns) * 1e-9
+            for item in change(message, seconds) if topic == "/imu" else (message,):
+                yield topic, ns, item
 
 
 @pytest.fixture(scope="module")
@@ -64,84 +69,52 @@ def flight(tmp_path_factory) -> Flight:
 
 
 class Flown:
-    """What became of the frames."""
+    """What became of the frames of a flight, or of so many of them."""
 
-    def __init__(self, flight: Flight) -> None:
-        self._truth = flight.truth
-        self.results: list[Localized | Refusal] = []
+    def __init__(
+        self, flight: Flight, change: Change = lambda message, time: (message,),
+        config: NodeConfig = CONFIG, mounting: Any = None, most: int = 1000,
+    ) -> None:  # fmt: skip
+        self.flight, self.results = flight, list[Localized | Refusal]()
         self.notices: Counter[str] = Counter()
-        self.state: Any = None
+        tree = TransformTree()
+        if mounting is not False:
+            tree.add(mounting or flight.mounting, static=True)
+        localizer = CameraFrames(config, lambda name, _: self.notices.update((name,)), tree)
 
-    @property
-    def frames(self) -> list[Localized]:
-        return [result for result in self.results if isinstance(result, Localized)]
+        def awaits(item: tuple[str, int, Any]) -> bool:
+            frame = item[0] == "/correspondences"
+            return frame and localizer.awaits_readings(stamp_ns(item[2]), 1.0)
 
-    def errors(self) -> tuple[Any, Any]:
-        """Degrees and metres of each frame."""
-        rows = {stamp: row for row, stamp in enumerate(self._truth.stamps_ns.tolist())}
-        degrees, metres = [], []
-        for frame in self.frames:
-            row = rows[frame.stamp_ns]
-            true = Rotation.from_quat(self._truth.quaternions[row])
-            turn = true.inv() * Rotation.from_matrix(frame.pose.rotation)
-            degrees.append(math.degrees(turn.magnitude()))
-            metres.append(np.linalg.norm(frame.pose.position - self._truth.positions[row]))
-        return np.array(degrees), np.array(metres)
+        for topic, _, message in imu_first(flight.changed(change), "/imu", awaits):
+            if len(self.results) == most:
+                break
+            if topic == "/camera_info":
+                localizer.calibrate(read_camera_info(message))
+            elif topic == "/imu":
+                localizer.aid.add(read_imu(message))
+            else:
+                self.results.append(localizer.localize(message))
+        self.state: Any = localizer.aid.state
 
-    def assert_none_is_lost_or_wrong(self, count: int) -> None:
+    def errors(self) -> Any:
+        """Degrees and metres (n,2) of each frame, and their largest deviations (n,2)."""
+        found = []
+        for frame in self.results:
+            place, turn = self.flight.truth[frame.stamp_ns]
+            off = Rotation.from_quat(turn).inv() * Rotation.from_matrix(frame.pose.rotation)
+            far = np.linalg.norm(frame.pose.position - place)
+            widest = np.sqrt(np.diag(frame.pose.covariance).reshape(2, 3).max(axis=1))
+            found.append([math.degrees(off.magnitude()), far, math.degrees(widest[1]), widest[0]])
+        return np.hsplit(np.array(found), 2)
+
+    def assert_none_is_lost_or_wrong(self) -> None:
         """Wrong is what is far off, and farther than its covariance says."""
-        assert len(self.frames) == count
-        degrees, metres = self.errors()
-        covariances = np.array([frame.pose.covariance for frame in self.frames])
-        variances = np.diagonal(covariances, axis1=1, axis2=2)
-        place, turn = (np.sqrt(variances[:, part].max(axis=1)) for part in (slice(3), slice(3, 6)))
-        assert np.all(metres < np.maximum(0.03, 5.0 * place))
-        assert np.all(degrees < np.maximum(0.6, 5.0 * np.degrees(turn)))
-        assert np.median(metres) < 0.005
-        assert np.median(degrees) < 0.2
-
-
-def fly(
-    flight: Flight,
-    change: Change = lambda message, time: (message,),
-    config: NodeConfig = CONFIG,
-    mounting: Any = None,
-    most: int = 1000,
-) -> Flown:
-    """Localize a flight, or so many of its frames."""
-    flown = Flown(flight)
-    tree = TransformTree()
-    if mounting is not False:
-        tree.add(mounting or flight.mounting, static=True)
-    frames = CameraFrames(config, lambda name, _: flown.notices.update((name,)), tree)
-
-    def changed() -> Iterable[Item]:
-        for topic, recorded_ns, message in flight.items:
-            if topic != "/imu":
-                yield topic, recorded_ns, message
-                continue
-            for item in change(message, flight.since_start(recorded_ns)):
-                yield topic, recorded_ns, item
-
-    def awaits(item: Item) -> bool:
-        frame = item[0] == "/correspondences"
-        return frame and frames.awaits_readings(stamp_ns(item[2]), 1.0)
-
-    for topic, _, message in imu_first(changed(), "/imu", awaits):
-        if len(flown.results) == most:
-            break
-        if topic == "/camera_info":
-            frames.calibrate(read_camera_info(message))
-        elif topic == "/imu":
-            frames.aid.add(read_imu(message))
-        else:
-            flown.results.append(frames.localize(message))
-    flown.state = frames.aid.state
-    return flown
-
-
-def count(flight: Flight) -> int:
-    return sum(topic == "/correspondences" for topic, _, _ in flight.items)
+        assert len(self.results) == self.flight.count
+        assert all(self.results)
+        off, deviations = self.errors()
+        assert np.all(off < np.maximum([0.6, 0.03], 5.0 * deviations))
+        assert np.all(np.median(off, axis=0) < [0.2, 0.005])
 
 
 def later(message: Any, seconds: float) -> Any:
@@ -152,18 +125,15 @@ def later(message: Any, seconds: float) -> Any:
 
 
 def test_it_makes_poses_better(flight):
-    both, alone = fly(flight), fly(flight, lambda message, time: ())
-    both.assert_none_is_lost_or_wrong(count(flight))
+    both, alone = Flown(flight), Flown(flight, lambda message, time: ())
+    both.assert_none_is_lost_or_wrong()
     assert both.state.share > 0.95  # one frame in a thousand contradicts it by chance
     assert both.state.rate == pytest.approx(400.0)
     assert alone.state is None  # whoever has no IMU hears nothing of it
-    assert np.median(both.errors()[0]) < 0.75 * np.median(alone.errors()[0])
+    assert np.median(both.errors()[0][:, 0]) < 0.75 * np.median(alone.errors()[0][:, 0])
     # An IMU that is not used changes nothing, to the last bit.
-    for other in (
-        fly(flight, config=WITHOUT, most=30),
-        fly(flight, mounting=False, most=30),
-    ):
-        for a, b in zip(other.frames, alone.frames[:30], strict=True):
+    for other in Flown(flight, config=WITHOUT, most=30), Flown(flight, mounting=False, most=30):
+        for a, b in zip(other.results, alone.results[:30], strict=True):
             assert np.array_equal(a.pose.position, b.pose.position)
             assert np.array_equal(a.pose.rotation, b.pose.rotation)
 
@@ -186,8 +156,8 @@ FAULTS: dict[str, tuple[Change, ImuReason]] = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_the_camera_goes_on_alone(flight, fault):
     change, reason = FAULTS[fault]
-    flown = fly(flight, change)
-    flown.assert_none_is_lost_or_wrong(count(flight))
+    flown = Flown(flight, change)
+    flown.assert_none_is_lost_or_wrong()
     assert flown.state.reasons[reason] > 0
     lasts = fault not in ("is cut", "begins late")
     assert flown.notices[reason] == lasts  # told once, not at every frame
@@ -199,8 +169,8 @@ def test_a_wrong_mounting_is_noticed(flight):
     wrong = Rotation.from_quat([rotation.x, rotation.y, rotation.z, rotation.w])
     wrong = wrong * Rotation.from_euler("x", 180.0, degrees=True)
     rotation.x, rotation.y, rotation.z, rotation.w = wrong.as_quat().tolist()
-    flown = fly(flight, mounting=upside_down)
-    flown.assert_none_is_lost_or_wrong(count(flight))
+    flown = Flown(flight, mounting=upside_down)
+    flown.assert_none_is_lost_or_wrong()
     assert flown.state.mostly.reason == ImuReason.DISAGREES
 
 
@@ -208,7 +178,7 @@ def test_a_wrong_mounting_is_noticed(flight):
 def test_gravity_is_compared_with_the_map(flight, down, degrees):
     imu = Imu(gravity=True)
     config = NodeConfig(readout_time=READOUT_TIME, imu=imu, gravity_in_map=down)
-    flown = fly(flight, config=config)
+    flown = Flown(flight, config=config)
     assert math.degrees(flown.state.gravity) == pytest.approx(degrees, abs=5.0)
 
 
@@ -217,7 +187,7 @@ def test_without_a_readout_time_or_for_a_global_shutter_it_is_not_used_and_that_
         (NodeConfig(), ImuReason.NO_READOUT_TIME),
         (NodeConfig(readout_time=READOUT_TIME, solver="p3p"), ImuReason.NOT_TRACKING),
     ):
-        flown = fly(flight, config=config, most=8)
+        flown = Flown(flight, config=config, most=8)
         assert flown.state.mostly.reason == reason
         assert flown.notices[reason] == 1
 
