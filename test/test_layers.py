@@ -143,11 +143,7 @@ def test_a_localizer_loads_nothing_that_few_need():
 
 
 # What each folder of ros may import of the others; every folder has a row.
-ROS_MAY_IMPORT: dict[str, set[str]] = {
-    "node": set(),
-    "localizer": {"node"},
-    "detector": {"node"},
-}
+ROS_MAY_IMPORT: dict[str, set[str]] = {"node": set(), "localizer": {"node"}, "detector": {"node"}}
 
 
 def test_nodes_do_not_know_each_other():

@@ -12,13 +12,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.experiments import methods as m
 from benchmarks.experiments.methods import Method
 from benchmarks.experiments.results import Claim, Context, Result, Table, limited
-from benchmarks.experiments.sweeps import (
-    ORIENTATION,
-    POSE,
-    Curves,
-    motion_errors,
-    sweep,
-)
+from benchmarks.experiments.sweeps import ORIENTATION, POSE, Curves, motion_errors, sweep
 from benchmarks.experiments.trials import Motions, Setting, Trials, draw_trials
 from rs_localizer.core.arrays import Array
 

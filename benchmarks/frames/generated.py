@@ -15,12 +15,7 @@ import numpy as np
 
 from benchmarks.frames.conditions import Condition, Motion, Points
 from benchmarks.independent.cameras import Camera
-from benchmarks.independent.frames import (
-    Displaced,
-    Frames,
-    first_row_times,
-    simulate,
-)
+from benchmarks.independent.frames import Displaced, Frames, first_row_times, simulate
 from benchmarks.independent.motions import IntArray, Moving, States, directions
 from benchmarks.independent.rotations import Array, exponential
 from benchmarks.independent.scenes import Scene, visible

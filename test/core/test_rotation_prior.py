@@ -6,13 +6,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
-from rs_localizer.core.rotation_prior import (
-    NODES,
-    WHOLE,
-    RotationPrior,
-    compensated,
-    parts_of,
-)
+from rs_localizer.core.rotation_prior import NODES, WHOLE, RotationPrior, compensated, parts_of
 from rs_localizer.core.so3 import hat
 
 TAU = np.linspace(-0.8, 0.8, 33)

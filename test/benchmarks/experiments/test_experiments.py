@@ -43,11 +43,7 @@ HELD = _names(
     }
 )
 NOT_HELD = _names(
-    {
-        "motion": "r9p_ahead_noisy r9p_no_velocity",
-        "noise": "all_alike",
-        "sequences": "r9p_best",
-    }
+    {"motion": "r9p_ahead_noisy r9p_no_velocity", "noise": "all_alike", "sequences": "r9p_best"}
 )
 
 

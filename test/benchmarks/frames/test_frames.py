@@ -12,14 +12,7 @@ from benchmarks.frames import __main__ as command
 from benchmarks.frames.compared import changes_of, read, totals
 from benchmarks.frames.conditions import NARROW, Condition, Points, turning
 from benchmarks.frames.generated import generate
-from benchmarks.frames.judged import (
-    FIGURES,
-    FIVE_SIGMA,
-    REGION,
-    Judged,
-    of_pose,
-    of_twist,
-)
+from benchmarks.frames.judged import FIGURES, FIVE_SIGMA, REGION, Judged, of_pose, of_twist
 from benchmarks.independent.rotations import logarithm
 from benchmarks.independent.scenes import SmallPlane
 from rs_localizer.io.outputs import BodyPose, Twist
