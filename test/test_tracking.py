@@ -45,19 +45,12 @@ class Hand:
         return rotation.as_matrix(), place
 
     def motion(self, t):
-        """The truth at one moment, velocities and accelerations by finite differences."""
+        """The truth at one moment, velocities by finite differences."""
         h = 1e-5
         (rotation, place), (ahead, there), (_, before) = (self.pose(x) for x in (t, t + h, t - h))
         rate = Rotation.from_matrix(rotation.T @ ahead).as_rotvec() / h
         velocity = rotation.T @ (there - before) / (2 * h)
-        h = 1e-3
-        (later, there), (earlier, before) = self.pose(t + h), self.pose(t - h)
-        turns = (Rotation.from_matrix(rotation.T @ r).as_rotvec() for r in (later, earlier))
-        return rsl.Motion(
-            rotation.T, -rotation.T @ place, READOUT * rate, READOUT * velocity,
-            angular_acceleration=READOUT**2 * sum(turns) / h**2,
-            linear_acceleration=READOUT**2 * rotation.T @ (there - 2 * place + before) / h**2,
-        )  # fmt: skip
+        return rsl.Motion(rotation.T, -rotation.T @ place, READOUT * rate, READOUT * velocity)
 
     def frame(self, t, count, points=MAP, noise=1.0, outliers=0.0):
         rng = np.random.default_rng(round(t * 1e4))

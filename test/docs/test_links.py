@@ -32,13 +32,6 @@ def test_files_and_folders_that_are_named_exist(page):
     assert missing == set()
 
 
-@pytest.mark.parametrize("page", pages.NAMES)
-def test_lines_are_short(page):
-    """They are read in terminals and in diffs; an address cannot be broken."""
-    lines = [line for line in pages.text(page).splitlines() if len(line) > 100]
-    assert [line for line in lines if "://" not in line] == []
-
-
 def test_every_page_can_be_reached_from_the_readme():
     reached, waiting = set(), ["README.md"]
     while waiting:

@@ -1,9 +1,11 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Motions with errors."""
+"""Motions with errors, and what these make of functions of the motion."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
@@ -26,3 +28,12 @@ def disturbed(motion: Estimate, error: Array) -> Estimate:
         linear_acceleration=motion.linear_acceleration + d_a,
         shake=motion.shake + error[18:].reshape(-1, 3),
     )
+
+
+def covariance_of(function: Callable[[Array], Array], of: Array, step: float) -> Array:
+    """Of a function of errors with this covariance, by central differences."""
+    units = step * np.eye(len(of))
+    columns = [(function(unit) - function(-unit)) / (2.0 * step) for unit in units]
+    jacobian = np.array(columns).T
+    result: Array = jacobian @ of @ jacobian.T
+    return result

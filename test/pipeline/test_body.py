@@ -40,7 +40,7 @@ from rs_localizer.pipeline.map_to_odom import CorrectionState
 from rs_localizer.pipeline.published import Broadcast, broadcast
 from rs_localizer.pipeline.refusal import Refusal
 
-from .motions import disturbed
+from .motions import covariance_of, disturbed
 
 READOUT_TIME = 0.03
 STAMP_NS = 5_000_000_000
@@ -203,13 +203,6 @@ def localized(result: tuple[Localized | Refusal, NodeConfig]) -> Localized:
     return result[0]
 
 
-def covariance(function: Callable[[Array], Array], of: Array, step: float) -> Array:
-    columns = [(function(step * e) - function(-step * e)) / (2.0 * step) for e in np.eye(18)]
-    jacobian = np.array(columns).T
-    result: Array = jacobian @ of @ jacobian.T
-    return result
-
-
 @pytest.mark.parametrize("direction", list(ScanDirection))
 @pytest.mark.parametrize("pose_time", list(PoseTime))
 def test_every_quantity(localize, robot, pose_time, direction):
@@ -244,13 +237,10 @@ def test_every_quantity(localize, robot, pose_time, direction):
     assert np.allclose(frame.pose.position, pose[:3, 3], atol=1e-12)
     assert np.allclose(frame.pose.rotation, pose[:3, :3], atol=1e-12)
     assert np.allclose([*frame.twist.linear, *frame.twist.angular], twist, atol=2e-6)
-    expected = covariance(
-        lambda error: truth.pose_error(published, error), estimate().joint_covariance, 1e-5
-    )
+    joint = estimate().joint_covariance
+    expected = covariance_of(lambda error: truth.pose_error(published, error), joint, 1e-5)
     assert np.allclose(frame.pose.covariance, expected, rtol=1e-6, atol=1e-9)
-    expected = covariance(
-        lambda error: truth.twist_error(published, error), estimate().joint_covariance, 1e-3
-    )
+    expected = covariance_of(lambda error: truth.twist_error(published, error), joint, 1e-3)
     assert np.allclose(frame.twist.covariance, expected, atol=1e-5 * np.abs(expected).max())
 
     made = messages(frame, make_message)

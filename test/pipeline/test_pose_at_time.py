@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pose, twist and covariances at a moment, against finite differences of the motion model."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.types import Estimate
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at, with_timing
 
-from .motions import disturbed
+from .motions import covariance_of, disturbed
 
 READOUT_TIME = 0.03
 TAUS = [-0.5, 0.0, 0.3, -7.0]
@@ -86,14 +85,6 @@ def twist(motion: Estimate, tau: float) -> Array:
     return np.concatenate([linear, angular])
 
 
-def covariance(motion: Estimate, function: Callable[[Array], Array], step: float) -> Array:
-    """Of a function of the motion's errors, by central differences."""
-    units = step * np.eye(len(motion.joint_covariance))
-    columns = [(function(unit) - function(-unit)) / (2.0 * step) for unit in units]
-    jacobian = np.array(columns).T
-    return jacobian @ motion.joint_covariance @ jacobian.T
-
-
 @pytest.mark.parametrize("tau", TAUS)
 @pytest.mark.parametrize("rate", RATES)
 def test_pose_and_its_rate_of_change(rate, tau):
@@ -105,12 +96,13 @@ def test_pose_and_its_rate_of_change(rate, tau):
     expected = twist(motion, tau)
     assert np.allclose([*velocities.linear, *velocities.angular], expected, rtol=1e-6, atol=2e-6)
     motion = estimate(rate)
-    expected = covariance(motion, lambda error: pose_error(motion, tau, error), 1e-5)
+    joint = motion.joint_covariance
+    expected = covariance_of(lambda error: pose_error(motion, tau, error), joint, 1e-5)
     assert np.allclose(pose_at(motion, tau).covariance, expected, rtol=1e-6, atol=1e-9)
     # Far outside the readout there is no shaking.
-    joint = motion.joint_covariance[:18, :18]
+    joint = joint[:18, :18]
     motion = replace(motion, shake=np.zeros((0, 3)), joint_covariance=joint)
-    expected = covariance(motion, lambda error: twist(disturbed(motion, error), tau), 1e-4)
+    expected = covariance_of(lambda error: twist(disturbed(motion, error), tau), joint, 1e-4)
     found = twist_at(motion, tau, READOUT_TIME)
     assert np.allclose(found.covariance, expected, atol=1e-4 * np.abs(expected).max())
 
@@ -125,7 +117,7 @@ def test_covariances_of_an_uneven_motion(acceleration, shake, tau):
         (twist_at(motion, tau, READOUT_TIME).covariance,
          lambda error: twist(disturbed(motion, error), tau), 1e-4),
     ):  # fmt: skip
-        expected = covariance(motion, function, step)
+        expected = covariance_of(function, motion.joint_covariance, step)
         scale = np.sqrt(np.diag(expected))
         assert np.allclose(found / np.outer(scale, scale), expected / np.outer(scale, scale),
                            atol=0.005)  # fmt: skip
