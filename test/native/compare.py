@@ -35,25 +35,22 @@ DETERMINED = {
 def leaves(value):
     """All arrays and numbers in a result, in order."""
     if isinstance(value, tuple):
-        for part in value:
-            yield from leaves(part)
-    elif value is not None:
-        yield np.asarray(value)
+        return [leaf for part in value for leaf in leaves(part)]
+    return [] if value is None else [np.asarray(value)]
 
 
-def difference(ours, theirs):
+def apart(ours, theirs):
     """The largest difference by the size of what should be there; infinite: of another kind."""
-    ours, theirs = list(leaves(ours)), list(leaves(theirs))
+    ours, theirs = leaves(ours), leaves(theirs)
     if [(x.shape, x.dtype) for x in ours] != [(x.shape, x.dtype) for x in theirs]:
         return np.inf
     most = 0.0
     for x, y in zip(ours, theirs, strict=True):
-        if np.array_equal(x, y, equal_nan=x.dtype.kind == "f"):
+        if x.dtype.kind != "f" or not np.array_equal(known := np.isfinite(y), np.isfinite(x)):
+            most = max(most, 0.0 if np.array_equal(x, y) else np.inf)
             continue
-        if x.dtype.kind != "f" or not np.array_equal(np.isfinite(x), np.isfinite(y)):
-            return np.inf
-        size = np.abs(y[np.isfinite(y)]).max(initial=0.0)
-        most = max(most, np.abs(x - y)[np.isfinite(y)].max(initial=0.0) / max(size, 1e-300))
+        size = np.abs(y[known]).max(initial=1e-300)
+        most = max(most, np.abs(x - y)[known].max(initial=0.0) / size)
     return most
 
 
@@ -62,28 +59,18 @@ def nudged(value, rng):
     if isinstance(value, tuple):
         parts = [nudged(part, rng) for part in value]
         return value._make(parts) if hasattr(value, "_make") else tuple(parts)
-    if isinstance(value, np.ndarray) and value.dtype == np.float64:
-        return value * (1.0 + np.finfo(float).eps * rng.integers(-1, 2, value.shape))
-    if isinstance(value, float):
-        return value * (1.0 + float(np.finfo(float).eps) * int(rng.integers(-1, 2)))
+    if isinstance(value, float) or (isinstance(value, np.ndarray) and value.dtype == np.float64):
+        steps = rng.integers(-1, 2, np.shape(value))
+        return value * (1.0 + np.finfo(float).eps * (steps if np.ndim(value) else int(steps)))
     return copy.deepcopy(value)
 
 
-def answer(entry, arguments):
-    """What an entry gives, its arguments after it, and its error."""
+def answer(entry, arguments, determined):
+    """What of a result is determined, the arguments after the call, and the error."""
     try:
-        return entry(*arguments), arguments, None
+        return (determined(entry(*arguments)), arguments), None
     except Exception as fault:
-        return None, arguments, (type(fault), str(fault))
-
-
-def apart(one, other, determined):
-    """How far two answers differ."""
-    if one[2] != other[2]:
-        return np.inf
-    if one[0] is None or other[0] is None:
-        return difference(one[:2], other[:2])
-    return max(difference(determined(one[0]), determined(other[0])), difference(one[1], other[1]))
+        return (None, arguments), (type(fault), str(fault))
 
 
 def compare(calls):
@@ -95,12 +82,15 @@ def compare(calls):
         determined = DETERMINED.get(name, lambda whole: whole)
         most, is_far = 0.0, False
         for before, after, result, error in answered:
-            ours = answer(entry, copy.deepcopy(before))
-            off = apart(ours, (result, after, error), determined)
+            ours, said = answer(entry, copy.deepcopy(before), determined)
+            theirs = None if error else determined(result), after
+            off = apart(ours, theirs) if said == error else np.inf
             most = max(most, off)
             if off > CLOSE:
-                moved = (answer(entry, nudged(before, rng)) for _ in range(NUDGES))
-                is_far |= not off < max(apart(other, ours, determined) for other in moved)
+                moved = (answer(entry, nudged(before, rng), determined) for _ in range(NUDGES))
+                is_far |= not off < max(
+                    apart(other, ours) if fault == said else np.inf for other, fault in moved
+                )
         yield name, most, is_far
 
 
