@@ -151,8 +151,7 @@ class Tally:
     repeated: int = 0
     seconds: float = 0.0
     moving: bool = False  # whether there are twists
-    smoothed: Counter[str] | None = None  # what became of the moments of one that was smoothed
-    bridged: array[int] = field(default_factory=lambda: array("q"))  # ns, without an image
+    smoothed: Any = None  # what became of the moments of one that was smoothed
     aid: AidState | None = None
     readout: tuple[float, float] | None = None  # s, as the motion shows it, and its deviation
     _stamps_ns: array[int] = field(default_factory=lambda: array("q"))  # of the images
@@ -166,15 +165,6 @@ class Tally:
             estimate.residual_rms, estimate.model_error, int(np.count_nonzero(estimate.inliers)),
             len(estimate.inliers), estimate.tracked, frame.dropped, frame.known_twist is not None,
         ))  # fmt: skip
-
-    def smooth(self, part: Any) -> list[Localized]:
-        """Count the frames of a window of ``tools.smoothed``, and give them."""
-        self.smoothed = Counter() if self.smoothed is None else self.smoothed
-        self.smoothed.update(
-            samples=len(part.frames), undetermined=part.undetermined, shaken=part.shaken
-        )
-        self.bridged.extend(part.bridged.tolist())
-        return list(part.frames)
 
     def refuse(self, refusal: Refusal) -> None:
         """Count a message without one."""
@@ -209,9 +199,9 @@ class Tally:
         return float(np.median(steps / np.round(steps / steps.min()))) if len(steps) else np.nan
 
 
-Smooth = Callable[[Iterator[Localized], list[int]], Iterable[Any]]
-"""One motion through frames, by windows: of frames, and the stamps (ns) of all images; as
-``tools.smoothed`` makes it."""
+Smooth = Callable[[Iterator[Localized], list[int]], Any]
+"""One motion through frames: of frames, and the stamps (ns) of all images; as ``tools.smoothed``
+makes it."""
 
 
 def write_results(
@@ -250,10 +240,8 @@ def write_results(
         frames: Iterable[tuple[int, Localized]] = localized()
         if smooth is not None:
             stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
-            parts = smooth((frame for _, frame in localized()), stamps)
-            frames = (
-                (frame.input_stamp_ns, frame) for part in parts for frame in tally.smooth(part)
-            )
+            tally.smoothed = smooth((frame for _, frame in localized()), stamps)
+            frames = ((frame.input_stamp_ns, frame) for frame in tally.smoothed.frames)
         for recorded_ns, frame in frames:
             write_frame(writer, frame, localizer, recorded_ns, tally)
             tally.track.add(frame)
@@ -262,7 +250,8 @@ def write_results(
                 if smooth is not None:
                     smoothed.add(frame.input_stamp_ns)
     if tally.smoothed is not None:
-        text = "".join(f"{stamp // 10**9}.{stamp % 10**9:09}\n" for stamp in tally.bridged)
+        stamps = tally.smoothed.bridged.tolist()
+        text = "".join(f"{stamp // 10**9}.{stamp % 10**9:09}\n" for stamp in stamps)
         (out / BRIDGED).write_text(text, encoding="utf-8")
     if tally.table is not None:
         for answer in refused:
@@ -314,10 +303,10 @@ def summary(tally: Tally, config: NodeConfig, out: Path, timed: bool = True) -> 
         rows.append(("frames per second", f"{tally.total / tally.seconds:.0f}"))
     if (smoothed := tally.smoothed) is not None:
         rows += [
-            ("samples of the smoothed motion", smoothed["samples"]),
-            (f"  bridged, listed in {BRIDGED}", len(tally.bridged)),
-            ("  left out, not determined", smoothed["undetermined"]),
-            ("  vibrating, left as they were", smoothed["shaken"]),
+            ("samples of the smoothed motion", len(smoothed.frames)),
+            (f"  bridged, listed in {BRIDGED}", len(smoothed.bridged)),
+            ("  left out, not determined", smoothed.undetermined),
+            ("  vibrating, left as they were", smoothed.shaken),
         ]
     lines = [f"{name:40} {text!s:>8}" for name, text in rows]
     reasons = (*tally.refused, *(tally.aid.reasons if tally.aid else ()))

@@ -1,81 +1,48 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Smoothing in windows: as in one piece, with no more than a window's frames in memory."""
+"""Smoothing of a recording's frames: which moments have one, and whose pose it is."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from recorded import record
 
 from rs_localizer.cli.commands import main
 from rs_localizer.config import NodeConfig
-from rs_localizer.core import so3
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Localized
 from rs_localizer.offline.replay import find_topics, find_transforms, replay
 from rs_localizer.pipeline.camera_frames import CameraFrames
-from rs_localizer.tools import smoothed
 from rs_localizer.tools.smoothed import smooth_frames
 
 CONFIG = NodeConfig(readout_time=0.03)
-SECOND = 10**9
 Recorded = tuple[CameraFrames, list[Localized], list[int]]
 """With what it was localized, the frames, the stamps of all images."""
 
 
 @pytest.fixture(scope="module")
-def recorded(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Recorded:
-    """Six seconds, localized."""
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    """One second, localized."""
     path = tmp_path_factory.mktemp("smoothed") / "flight"
-    words = "--trajectory tum_vi_room5 --start 20 --duration 6 --points 40 --outliers 0"
+    words = "--trajectory tum_vi_room5 --start 20 --duration 1 --points 40 --outliers 0"
     assert main(["simulate", str(path), *words.split(), "--seed", "3"]) == 0
     localizer = CameraFrames(CONFIG)
     with open_bag(path) as bag:
         topics = find_topics(bag)
         frames = [frame for a in replay(bag, topics, localizer) if (frame := a.result)]
         stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
-    assert len(frames) > 150
+    assert len(frames) > 25
     return localizer, frames, stamps
-
-
-def in_windows(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
-    monkeypatch.setattr(smoothed, "_WINDOW_NS", round(seconds * SECOND))
-    monkeypatch.setattr(smoothed, "_MARGIN_NS", round(0.5 * SECOND))
-
-
-def test_windows_say_what_one_piece_says(
-    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    localizer, frames, stamps = recorded
-    (whole,) = smooth_frames(localizer, frames, stamps, None)
-    in_windows(monkeypatch, 2.0)
-    parts = list(smooth_frames(localizer, frames, stamps, None))
-    assert len(parts) > 2
-    assert sum(part.undetermined for part in parts) == whole.undetermined
-    found = [frame for part in parts for frame in part.frames]
-    assert [f.stamp_ns for f in found] == [f.stamp_ns for f in whole.frames]
-    for one, other in zip(found, whole.frames, strict=True):
-        step = np.concatenate([
-            one.pose.position - other.pose.position,
-            so3.log(np.ascontiguousarray(one.pose.rotation @ other.pose.rotation.T)),
-        ])  # fmt: skip
-        squared = step @ np.linalg.solve(other.pose.covariance, step) / 6.0
-        # Knots lie elsewhere, and the accelerations that are expected are those of the window.
-        assert squared < 0.5**2
 
 
 def test_the_last_frame_is_smoothed_though_its_stamp_is_beyond_all(recorded: Recorded) -> None:
     """As in a rig whose first camera has lost its last image."""
     localizer, frames, stamps = recorded
-    parts = smooth_frames(localizer, frames, [ns for ns in stamps if ns < stamps[-1]], None)
-    found = [frame.input_stamp_ns for part in parts for frame in part.frames]
-    assert found[-1] == frames[-1].input_stamp_ns == stamps[-1]
+    found = smooth_frames(localizer, frames, stamps[:-1], None).frames
+    assert found[-1].input_stamp_ns == frames[-1].input_stamp_ns == stamps[-1]
 
 
 def test_frames_of_a_vibrating_camera_keep_their_own_poses(tmp_path: Path) -> None:
@@ -89,6 +56,6 @@ def test_frames_of_a_vibrating_camera_keep_their_own_poses(tmp_path: Path) -> No
         localizer = CameraFrames(CONFIG, transforms=find_transforms(bag, topics, CONFIG))
         frames = [frame for a in replay(bag, topics, localizer) if (frame := a.result)]
         stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
-    (part,) = smooth_frames(localizer, frames, stamps, None)
+    part = smooth_frames(localizer, frames, stamps, None)
     assert part.shaken == len(part.frames) == len(frames) == 90
     assert all(one is other for one, other in zip(part.frames, frames, strict=True))
