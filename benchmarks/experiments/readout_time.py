@@ -53,7 +53,7 @@ class Trial:
     def bound(self) -> float:
         """Cramér-Rao bound of its inliers, s."""
         fit = self.found.fit
-        return float(self.found.formal_deviation / np.sqrt(fit.inflation) * _NOISE / fit.deviation)
+        return float(fit.readout_time_deviation / np.sqrt(fit.inflation) * _NOISE / fit.deviation)
 
 
 def run(context: Context) -> Result:

@@ -7,18 +7,18 @@ from __future__ import annotations
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, image_input, refuse_existing, write_all
-from rs_localizer.cli.image_input import ImageOptions, given_lens
+from rs_localizer.cli import WORKING, refuse_existing, write_all
+from rs_localizer.cli.image_input import ImageOptions, each_image, recorded
 from rs_localizer.cli.marker_map import TargetOptions, find_map
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
-from rs_localizer.cli.rig_input import cameras_of, check_there, mounting_lines
-from rs_localizer.cli.settings_args import given_settings, given_topics, remapped
+from rs_localizer.cli.rig_input import cameras_of, check_there
+from rs_localizer.cli.settings_args import given_settings, remapped
 from rs_localizer.cli.typed import typed
 from rs_localizer.io.topics import CAMERA_INFO, IMAGE, IMU
 
@@ -36,11 +36,9 @@ if WORKING:
     from rs_localizer.localizer import Localizer
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.markers.maps import MarkerMap
-    from rs_localizer.offline.detect import ImageTally, usable
     from rs_localizer.offline.fleet import Figures
-    from rs_localizer.offline.image_sources import Carried, Shot
-    from rs_localizer.offline.recordings import optical_frame, read_imu_recording, read_recording
-    from rs_localizer.offline.replay import find_topics, has_frames
+    from rs_localizer.offline.recordings import optical_frame, read_imu_recording
+    from rs_localizer.offline.replay import has_frames
     from rs_localizer.pipeline.marker_detector import FrameDetector
     from rs_localizer.pipeline.what_fits import ids_of, mistake_of
     from rs_localizer.settings import write_camera_file
@@ -95,33 +93,48 @@ class _Input:
 
 
 def run(options: Options) -> Mapping[str, object]:
-    if options.out is not None and options.out.suffix not in (".yaml", ".yml"):
-        raise UsageError(f"--out must end in .yaml, got {options.out}")
-    if options.camera_info is not None and options.out is None:
+    out, beside = options.out, list[Path]()
+    if out is not None and out.suffix not in (".yaml", ".yml"):
+        raise UsageError(f"--out must end in .yaml, got {out}")
+    if options.camera_info is not None and out is None:
         raise UsageError("--camera-info goes with --out")
     if options.rig:
-        return _calibrate_rig(options)
-    if len(options.recordings) > 1:
-        raise UsageError("several recordings are those of a --rig")
-    return _calibrate_one(replace(options, recording=options.recordings[0]))
-
-
-def _calibrate_one(args: Options) -> Figures:
-    """Calibrate with one recording, and say what was found."""
-    if args.out is not None:
-        of_images = args.map is not None or args.board is not None
-        maps = [_beside(args.out, _MAP)] if of_images else []
-        refuse_existing(args, args.out, *maps, *_lens_file(args, ""))
-    config = given_settings(args)
-    source = _read(args, config)
-    camera = replace(source.camera, scan_direction=config.scan_direction)
-    found = _calibrated(args, source, camera, config)
-    refusal = verdict.refusal(found)
-    if args.out is not None and not verdict.lens_refusal(found):
-        refusal = _write(args, args.out, found, source, config, refusal)
+        if options.imu:
+            raise UsageError("--imu is for one camera: leave it out with --rig")
+        # Cameras by name need a readout time; what it is does not matter where it is estimated.
+        options = replace(options, assignments=["readout_time:=0.03", *options.assignments])
+        config = given_settings(options)
+        cameras = cameras_of(options, options.recordings, config)
+    else:
+        if len(options.recordings) > 1:
+            raise UsageError("several recordings are those of a --rig")
+        config = given_settings(options)
+        cameras = {"": (replace(options, recording=options.recordings[0]), "")}
+    if out is not None:
+        if options.rig:
+            beside = [_beside(out, _TRANSFORMS)]
+        elif options.map is not None or options.board is not None:
+            beside = [_beside(out, _MAP)]
+        lenses = _lens_writers(options, dict.fromkeys(cameras))
+        refuse_existing(options, out, *beside, *lenses)
+    sources, found = dict[str, _Input](), dict[str, CameraCalibration]()
+    for name, (own, _) in cameras.items():
+        if name:
+            print(f"{name}:")
+        axis = config.of_cameras.get(name, config).scan_direction
+        source = _read(own, replace(config, scan_direction=axis))
+        sources[name] = replace(source, camera=replace(source.camera, scan_direction=axis))
+        found[name] = _calibrated(own, sources[name], config)
+    if options.rig:
+        frames = {name: frame for name, (_, frame) in cameras.items()}
+        _mount(options, sources, found, config, frames)
+        return {name: _figures(each) for name, each in found.items()}
+    refusal = verdict.refusal(found[""])
+    if out is not None and not verdict.lens_refusal(found[""]):
+        refusal = _write(cameras[""][0], out, found[""], sources[""], config, refusal)
     if refusal:
         raise ValueError(refusal)
-    return _figures(found)
+    return _figures(found[""])
 
 
 def _figures(found: CameraCalibration) -> Figures:
@@ -140,19 +153,22 @@ def _beside(out: Path, name: str) -> Path:
     return out.with_name(f"{out.stem}_{name}")
 
 
-def _lens_file(args: Options, name: str) -> list[Path]:
-    """Return the file of a camera's lens alone, if it is wanted; of a rig ``FILE_NAME``."""
+def _lens_writers(args: Options, cameras: Mapping[str, Camera | None]) -> Writers:
+    """Return what writes the single lenses, if they are wanted; of a rig to ``FILE_NAME``."""
     file = args.camera_info
-    return [file.with_stem(f"{file.stem}_{name}") if name else file] if file else []
+    return {
+        file.with_stem(f"{file.stem}_{name}") if name else file: partial(
+            write_calibration, camera=camera
+        )
+        for name, camera in (cameras if file else {}).items()
+    }
 
 
-def _calibrated(
-    args: Options, source: _Input, camera: Camera, config: NodeConfig
-) -> CameraCalibration:
+def _calibrated(args: Options, source: _Input, config: NodeConfig) -> CameraCalibration:
     """Calibrate a camera by its images and print the result."""
     with tqdm(total=len(source.images), unit="image", desc="localize", disable=None) as bar:
         found = calibrate(
-            camera, source.images, intrinsics=source.find_lens, imu=source.imu,
+            source.camera, source.images, intrinsics=source.find_lens, imu=source.imu,
             own_stamps=source.own_stamps, done=bar.update,
         )  # fmt: skip
     print("\n".join(verdict.table(found, args.rate)))
@@ -166,40 +182,32 @@ def _calibrated(
 def _read(args: Options, config: NodeConfig) -> _Input:
     path = args.recording
     check_there([path])
-    of_bag = is_bag(path)
-    imu = _imu(args, path) if args.imu else None
+    of_bag, imu = is_bag(path), None
+    if args.imu:
+        if not of_bag:
+            raise UsageError("--imu is for bags, which have an IMU beside the images")
+        with open_bag(path) as bag:
+            topics = remapped(args)
+            frame = optical_frame(bag, topics.get(CAMERA_INFO))
+            imu = read_imu_recording(bag, topics.get(IMU), frame)
     if of_bag and IMAGE not in remapped(args):
         with open_bag(path) as bag:
             if has_frames(bag):
                 if args.rate is not None:
                     raise UsageError("--rate is for images; a bag has its own times")
                 return replace(_correspondences(args, bag, config), imu=imu)
-    with image_input.opened(args, calibrated=False) as source:
-        found = _detected(args, source.shots)
-    image_input.print_times(source.clock)
-    return replace(found, own_stamps=of_bag or (path.is_dir() and args.rate is None), imu=imu)
-
-
-def _imu(args: Options, path: Path) -> ImuRecording:
-    """Return the readings of the IMU of a bag."""
-    if not is_bag(path):
-        raise UsageError("--imu is for bags, which have an IMU beside the images")
-    with open_bag(path) as bag:
-        topics = remapped(args)
-        frame = optical_frame(bag, topics.get(CAMERA_INFO))
-        return read_imu_recording(bag, topics.get(IMU), frame)
+    own_stamps = of_bag or (path.is_dir() and args.rate is None)
+    return replace(_detected(args), own_stamps=own_stamps, imu=imu)
 
 
 def _correspondences(args: Options, bag: BagReader, config: NodeConfig) -> _Input:
     if args.board is not None:
         raise UsageError("--board is for images; the recording has correspondences")
-    topics = find_topics(bag, given_topics(args)).without(IMU)
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
-    recorded = read_recording(bag, topics, landmarks)
-    camera = given_lens(args) or recorded.calibration.camera(0.0, config.scan_direction)
-    frames = [(cloud.points, cloud.pixels, ids_of(cloud)) for cloud in recorded.clouds]
+    camera, clouds = recorded(args, bag, config, landmarks)
+    frames = [(cloud.points, cloud.pixels, ids_of(cloud)) for cloud in clouds]
     _warn(mistake_of(Localizer(camera, config), frames))
-    images = [ImagePoints(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in recorded.clouds]
+    images = [ImagePoints(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in clouds]
     return _Input(images, camera, args.intrinsics)
 
 
@@ -208,21 +216,19 @@ def _warn(*faults: str | None) -> None:
         print(f"warning: {fault}", file=sys.stderr)
 
 
-def _detected(args: Options, shots: Iterator[Shot | Carried]) -> _Input:
+def _detected(args: Options) -> _Input:
     marker_map = find_map(args)
     detector = FrameDetector(DetectorConfig(), lambda name, text: None, marker_map)
-    images, frames, tally = list[ImagePoints](), [], ImageTally()
+    images, frames = list[ImagePoints](), []
     camera: Camera | None = None
     size = (0, 0)
-    seen = usable(shots, NodeConfig().scan_direction, tally)
-    for _, image, own in tqdm(seen, unit="image", desc="detect", disable=None):
+    for image, own in each_image(args, NodeConfig().scan_direction, calibrated=False):
         camera, size = camera or own, image.pixels.shape[::-1]
         found = detector.detect(image).detections
         images.append(ImagePoints(image.stamp_ns, found.points, found.pixels))
         if len(found.points):
             frames.append((found.points, found.pixels, found.ids))
     print(f"{len(frames)} of {len(images)} images show the map")
-    image_input.print_left_out(tally.refused)
     _warn(detector.mistake)
     find_lens = args.intrinsics or camera is None
     camera = camera or first_lens(size, in_order(images))
@@ -311,72 +317,46 @@ def _deviations(
     return known
 
 
-def _lens_writers(args: Options, cameras: Mapping[str, Camera]) -> Writers:
-    """Return what writes the single lenses, if they are wanted."""
-    return {
-        file: partial(write_calibration, camera=camera)
-        for name, camera in cameras.items()
-        for file in _lens_file(args, name)
-    }
-
-
-def _calibrate_rig(args: Options) -> dict[str, Figures]:
-    """Calibrate each camera alone, then all together, and say what was found."""
-    if args.imu:
-        raise UsageError("--imu is for one camera: leave it out with --rig")
-    # Cameras by name need a readout time; what it is does not matter where it is estimated.
-    args = replace(args, assignments=["readout_time:=0.03", *args.assignments])
-    config, recordings, maps = given_settings(args), dict[str, Recording](), list[MarkerMap]()
-    cameras = cameras_of(args, args.recordings, config)
-    if args.out is not None:
-        lenses = [file for name in cameras for file in _lens_file(args, name)]
-        refuse_existing(args, args.out, _beside(args.out, _TRANSFORMS), *lenses)
-    intrinsics = False
-    for name, (own, _) in cameras.items():
-        print(f"{name}:")
-        axis = config.of_cameras.get(name, config).scan_direction
-        source = _read(own, replace(config, scan_direction=axis))
-        intrinsics |= source.find_lens
-        maps += [] if source.map is None else [source.map]
-        camera = replace(source.camera, scan_direction=axis)
-        recordings[name] = Recording(camera, _calibrated(own, source, camera, config))
-    said = {name: verdict.refusal(each.calibration) for name, each in recordings.items()}
-    if refusals := [f"{name}: {text}" for name, text in said.items() if text]:
+def _mount(
+    args: Options, sources: Mapping[str, _Input], found: Mapping[str, CameraCalibration],
+    config: NodeConfig, frames: Mapping[str, str],
+) -> None:  # fmt: skip
+    """Find how cameras that are calibrated are mounted on a rig, print it and write it."""
+    if refusals := [f"{n}: {text}" for n, one in found.items() if (text := verdict.refusal(one))]:
         raise ValueError("; ".join(refusals))
-    rig = calibrate_rig(recordings)
-    first, comments = next(iter(rig)), list[str]()
-    for name, mounted in list(rig.items())[1:]:
-        comments += mounting_lines(name, first, mounted.extrinsics, mounted.deviations)
-        print("\n".join(comments[-3:]))
+    recordings = {name: Recording(sources[name].camera, one) for name, one in found.items()}
+    rig, comments = calibrate_rig(recordings), list[str]()
+    first, *others = rig
+    for name in others:
+        comments += verdict.of_mount(name, first, rig[name])
+    print("\n".join(comments))
     if refusals := [f"{name}: {one.undetermined}" for name, one in rig.items() if one.undetermined]:
         raise ValueError(f"not observable: {'; '.join(refusals)}")
-    if args.out is not None:
-        frames = {name: frame for name, (_, frame) in cameras.items()}
-        alone = [each.calibration for each in recordings.values()] if intrinsics else []
-        parts = _parts(rig, recordings, config)
-        values = rigs.node_parameters(parts) | _deviations(alone, maps, config)
-        transforms = partial(rigs.write_static_transforms, parts=parts, frames=frames)
-        place, lens = _beside(args.out, _TRANSFORMS), rigs.mounted_lenses(parts)
-        write = partial(write_camera_file, values=values, lens=lens, remarks=comments)
-        single = _lens_writers(args, parts.cameras)
-        write_all({place: transforms, **single, args.out: write})
-        when = "next" if shutil.which("ros2") else "next, in a ROS 2 workspace"
-        print(f"{when}: {shlex.join(['ros2', 'launch', str(place)])}")
-    return {name: _figures(each.calibration) for name, each in recordings.items()}
+    if args.out is None:
+        return
+    alone = list(found.values()) if any(one.find_lens for one in sources.values()) else []
+    maps = [one.map for one in sources.values() if one.map is not None]
+    parts = _parts(rig, found, config)
+    values = rigs.node_parameters(parts) | _deviations(alone, maps, config)
+    place, lens = _beside(args.out, _TRANSFORMS), rigs.mounted_lenses(parts)
+    write_all({
+        place: partial(rigs.write_static_transforms, parts=parts, frames=frames),
+        **_lens_writers(args, parts.cameras),
+        args.out: partial(write_camera_file, values=values, lens=lens, remarks=comments),
+    })  # fmt: skip
+    when = "next" if shutil.which("ros2") else "next, in a ROS 2 workspace"
+    print(f"{when}: {shlex.join(['ros2', 'launch', str(place)])}")
 
 
 def _parts(
-    rig: Mapping[str, Mounted], recordings: Mapping[str, Recording], config: NodeConfig
+    rig: Mapping[str, Mounted], found: Mapping[str, CameraCalibration], config: NodeConfig
 ) -> RigParts:
     """Return the estimated rig in the axes of its first camera and by its clock."""
     cameras = {}
     for name, one in rig.items():
-        own = recordings[name].calibration
-        cameras[name] = replace(
-            one.camera,
-            readout_time=0.0 if own.global_shutter else abs(one.readout_time),
-            scan_direction=verdict.scan_direction(own),
-        )
+        known = 0.0 if found[name].global_shutter else abs(one.readout_time)
+        direction = verdict.scan_direction(found[name])
+        cameras[name] = replace(one.camera, readout_time=known, scan_direction=direction)
     mounts = {name: one.extrinsics for name, one in rig.items()}
     poses = {name: (own.axes, -own.axes @ own.centre) for name, own in mounts.items()}
     base = config.of_cameras.get(next(iter(rig)), config).stamp_offset

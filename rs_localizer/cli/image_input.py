@@ -12,18 +12,25 @@ from typing import Any
 
 from rs_localizer.cli import WORKING
 from rs_localizer.cli.options import SettingOptions, TopicOptions, UsageError, option
-from rs_localizer.cli.settings_args import given_values, remapped
+from rs_localizer.cli.settings_args import given_topics, given_values, remapped
 from rs_localizer.io.camera_files import CALIBRATION_KINDS, read_calibration
 from rs_localizer.io.image_clock import ImageClock, readout_fault
 from rs_localizer.io.recording import PARAMETERS
-from rs_localizer.io.topics import CAMERA_INFO, IMAGE
+from rs_localizer.io.topics import CAMERA_INFO, IMAGE, IMU
 from rs_localizer.pipeline.inputs import CAMERA_INFO_TYPE, IMAGE_TYPES
 from rs_localizer.settings import camera_values
 
 if WORKING:
+    from tqdm import tqdm
+
+    from rs_localizer.config import NodeConfig
     from rs_localizer.core.camera import Camera
-    from rs_localizer.io.bags import is_bag, open_bag
+    from rs_localizer.io.bags import BagReader, is_bag, open_bag
+    from rs_localizer.io.clouds import Correspondences
+    from rs_localizer.io.images import Image
+    from rs_localizer.io.maps.landmarks import Map
     from rs_localizer.io.video import has_times
+    from rs_localizer.offline.detect import ImageTally, usable
     from rs_localizer.offline.image_sources import (
         Carried,
         Shot,
@@ -33,6 +40,8 @@ if WORKING:
         image_files,
         name_times,
     )
+    from rs_localizer.offline.recordings import read_recording
+    from rs_localizer.offline.replay import find_topics
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,3 +153,25 @@ def opened(args: ImageOptions, calibrated: bool = True) -> Iterator[Source]:
     else:
         shots = from_video(path, camera, clock)
     yield Source(shots, total, clock)
+
+
+def each_image(
+    args: ImageOptions, direction: str, calibrated: bool = True
+) -> Iterator[tuple[Image, Camera | None]]:
+    """Yield the images of a recording, each with its lens, and then say how they were taken."""
+    tally = ImageTally()
+    with opened(args, calibrated) as source:
+        seen = usable(source.shots, direction, tally)
+        for _, image, camera in tqdm(seen, unit="image", desc="detect", disable=None):
+            yield image, camera
+    print_left_out(tally.refused)
+    print_times(source.clock)
+
+
+def recorded(
+    args: LensOptions, bag: BagReader, config: NodeConfig, landmarks: Map | None
+) -> tuple[Camera, tuple[Correspondences, ...]]:
+    """Return the lens of a bag, and its correspondences with the map that it saw."""
+    topics = find_topics(bag, given_topics(args)).without(IMU)
+    found = read_recording(bag, topics, landmarks)
+    return given_lens(args) or found.calibration.camera(0.0, config.scan_direction), found.clouds

@@ -15,16 +15,10 @@ from rs_localizer.cli.image_input import LensOptions
 from rs_localizer.cli.options import UsageError
 
 if WORKING:
-    import numpy as np
-    from scipy.spatial.transform import Rotation
-
     from rs_localizer.config import NodeConfig
-    from rs_localizer.core.arrays import Array
     from rs_localizer.io.bags import is_bag, open_bag
     from rs_localizer.offline.recordings import optical_frame
     from rs_localizer.offline.replay import camera_topics
-    from rs_localizer.tools.adjust.variables import Extrinsics
-    from rs_localizer.tools.verdict import numbers
 
 
 T = TypeVar("T", bound=LensOptions)
@@ -79,14 +73,3 @@ def _in_one_bag(path: Path, given: Sequence[str] | None) -> list[tuple[str, dict
             )
             for name, own in camera_topics(bag, given).items()
         ]
-
-
-def mounting_lines(name: str, first: str, mounted: Extrinsics, deviations: Array) -> list[str]:
-    """Describe a camera's mount beside the first one, and its clock; deviations (7,) rad, m, s."""
-    turn = Rotation.from_matrix(mounted.axes).as_quat(canonical=True)
-    turned, moved = np.degrees(deviations[:3]), 1e3 * deviations[3:6]
-    return [
-        f"{f'{name} <- {first}':26} {numbers(turn, 5)} (x y z w) +- {numbers(turned, 3)} deg",
-        f"{f'place in {first}':26} {numbers(1e3 * mounted.centre, 2)} +- {numbers(moved, 2)} mm",
-        f"{'offset of its stamps':26} {1e3 * mounted.offset:+.3f} +- {1e3 * deviations[6]:.3f} ms",
-    ]

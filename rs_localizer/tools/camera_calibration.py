@@ -120,7 +120,6 @@ _ACCELERATIONS, _LEAST_ACCELERATION = 1.5, 0.3
 class CameraCalibration(Evidence):
     """Findings of a recording on its camera."""
 
-    formal_deviation: float  # s, of the noise of the readout time alone
     fit: Fit
     posed: Posed
     images: int  # that show the map
@@ -307,7 +306,7 @@ def _judged(
         blocks_of(camera, observations, fitted),
         blocks_of(camera, observations, fitted, 2),
     )
-    formal, share = fitted.readout_time_deviation, _interval_share(fitted, stamps)
+    share = _interval_share(fitted, stamps)
     values = _values_of(blocks, "readout_time")
     # Of images that are missing where stamps are even, each part has a share of its own.
     deviations = np.hypot(_values_of(blocks, "deviation"), share * values)
@@ -322,12 +321,11 @@ def _judged(
     return CameraCalibration(
         readout_time=fitted.state.readout_time,
         deviation=math.hypot(
-            formal * inflation,
+            fitted.readout_time_deviation * inflation,
             share * fitted.state.readout_time,
             0.5 * apart_of(halves)[0],
             discrepancy(fitted.state.readout_time, values, inflation * deviations),
         ),
-        formal_deviation=formal,
         blocks=blocks,
         halves=halves,
         own_stamps=True,

@@ -138,7 +138,6 @@ class MountFound:
     bias_deviations: Array  # (3,) rad/s
     shape_deviations: Array  # (6,) as of GyroMount.shape
     noise: float  # rad/s, standard deviation of a sample and axis
-    samples: int
     inflation: float  # of the offset's deviation, because parts disagree; 1: they do not
 
     @property
@@ -246,7 +245,6 @@ def mount_of(camera: Camera, fitted: Fit, samples: GyroSamples, inflation: float
         bias_deviations=deviations[3:6],
         shape_deviations=deviations[DELAY + 1 :],
         noise=samples.deviation,
-        samples=len(Gyroscope(samples, fitted.state).samples.times),
         inflation=inflation,
     )
 

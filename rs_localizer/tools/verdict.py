@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -14,25 +14,19 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.scanning import REVERSED, ScanDirection
 from rs_localizer.io.imu import ImuRecording
 from rs_localizer.tools.camera_calibration import CameraCalibration
+from rs_localizer.tools.rig_mounts import Mounted
 
 # Beyond this (s rms) the images' own times are mentioned.
 _WORTH_A_WORD = 5e-4
-# A ninth of the image is not covered where no keypoint lies in more than this part of its cells,
-# of which there are this many along each side.
-_EMPTY, _CELLS = 0.5, 3
+# Ninths of the image by row; one in which no keypoint lies is a guess of the lens.
 _REGIONS = (
     ("top left", "top", "top right"), ("left", "middle", "right"),
     ("bottom left", "bottom", "bottom right"),
 )  # fmt: skip
-
 # A rotation that TF has otherwise by more than this (degrees), and more than chance, is doubted.
 _MOST_TURN, _SIGMAS = 1.0, 4.0
-# Source of the mount of the IMU on the camera.
-_GIVEN = "TF"
 # Corners that are bent by less (px) are those of a rectified film, or of a telephoto lens.
 _STRAIGHT = 1.5
-# A scale of the gyroscope that is worth a word.
-_LEAST_SCALE = 0.005
 
 
 def readout_time(result: CameraCalibration) -> float:
@@ -77,76 +71,56 @@ def moved(result: CameraCalibration, points: Array) -> Array:
     ])  # fmt: skip
 
 
-def remarks(result: CameraCalibration) -> list[str]:
-    """Return sentences on oddities, and on the worth of the value."""
-    said = []
+def remarks(result: CameraCalibration) -> Iterator[str]:
+    """Yield sentences on oddities, and on the worth of the value."""
     if result.global_shutter:
-        said.append(
+        yield (
             f"global shutter: 0 lies within the error of {1e3 * result.readout_time:+.3f} +- "
             f"{1e3 * result.deviation:.3f} ms"
         )
     if result.stamps.irregular:
-        said.append(
-            f"stamps are irregular: {1e3 * result.stamps.jitter:.2f} ms rms about even intervals"
-        )
+        yield f"stamps are irregular: {1e3 * result.stamps.jitter:.2f} ms rms about even intervals"
     if result.jitter > _WORTH_A_WORD:
-        said.append(
+        yield (
             f"exposures are {1e3 * result.jitter:.1f} ms rms off their stamps; their times were "
             "estimated, and the value depends on the mean interval"
         )
     if result.stamps.missing:
-        said.append(f"{result.stamps.missing} images are missing between the others")
+        yield f"{result.stamps.missing} images are missing between the others"
     if result.inflation > 1.0:
-        said.append(
-            f"parts of the recording differ ({result.parts} ms) by more than their noise: the "
-            f"deviation is {result.inflation:.1f} times that of the noise alone"
+        yield (
+            f"parts of the recording differ by more than their noise: the deviation is "
+            f"{result.inflation:.1f} times that of the noise alone"
         )
     if result.held:
-        said.append(
+        yield (
             f"the map's {result.held} points are taken as they are given: more than are estimated "
             "along; where they may be off by a thousandth of its size, show a smaller board"
         )
-    if regions := uncovered(result):
-        said.append(
-            f"never showed the map: {regions[0]} of the image ({', '.join(regions[1:])}); the lens "
-            "is a guess there"
-        )
-    return said
-
-
-def uncovered(result: CameraCalibration) -> list[str]:
-    """Say how much of the image no keypoint covers, and where; empty: hardly any."""
-    observations, camera = result.posed.observations, result.fit.camera
+    observations = result.posed.observations
     pixels = observations.pixels[observations.trusted]
-    cells = (pixels / camera.size * _CELLS * 3).astype(int).clip(0, 3 * _CELLS - 1)
-    empty = np.ones((3 * _CELLS, 3 * _CELLS), np.bool_)
-    empty[cells[:, 1], cells[:, 0]] = False
-    regions = empty.reshape(3, _CELLS, 3, _CELLS).mean(axis=(1, 3))
-    names = [
+    cells = (3.0 * pixels / result.fit.camera.size).astype(int).clip(0, 2)
+    shown = {(row, column) for column, row in cells.tolist()}
+    if empty := [
         name
-        for row, line in zip(regions, _REGIONS, strict=True)
-        for share, name in zip(row, line, strict=True)
-        if share > _EMPTY
-    ]
-    return [f"{empty.mean():.0%}", *names] if names else []
+        for row, names in enumerate(_REGIONS)
+        for column, name in enumerate(names)
+        if (row, column) not in shown
+    ]:
+        yield f"never showed the map: {', '.join(empty)} of the image; the lens is a guess there"
 
 
 def table(found: CameraCalibration, rate: float | None) -> Iterator[str]:
     """Yield rows of what was found; ``rate``: of the images, as it was given."""
     if found.processed:  # before figures that it makes worthless
         yield f"warning: {found.processed}"
-    for name, text in (
-        ("readout time", f"{1e3 * readout_time(found):.3f} ms"),
-        ("standard deviation", f"{1e3 * found.deviation:.3f} ms"),
-        ("of it by noise alone", f"{1e3 * found.formal_deviation:.3f} ms"),
-        ("scan_direction", str(scan_direction(found))),
-        ("interval between images", f"{1e3 * found.stamps.interval:.3f} ms"),
-        ("images with a pose", f"{len(found.posed.times)} of {found.images}"),
-        ("noise of the keypoints", f"{found.fit.deviation:.3f} px"),
-        ("keypoints that fit", f"{np.mean(found.fit.inliers):.1%}"),
-        ("spacing of the knots", f"{1e3 * found.fit.state.spline.layout.spacing:.1f} ms"),
-    ):
-        yield f"{name:26} {text}"
+    yield from _rows({
+        "readout time": f"{1e3 * readout_time(found):.3f} ms",
+        "standard deviation": f"{1e3 * found.deviation:.3f} ms",
+        "scan_direction": str(scan_direction(found)),
+        "images with a pose": f"{len(found.posed.times)} of {found.images}",
+        "noise of the keypoints": f"{found.fit.deviation:.3f} px",
+    })  # fmt: skip
     along = 1e3 * found.sense
     for block in found.blocks:
         yield (
@@ -155,22 +129,21 @@ def table(found: CameraCalibration, rate: float | None) -> Iterator[str]:
         )
     yield from remarks(found)
     if rate is not None:
-        share = abs(found.readout_time) / found.stamps.interval
-        yield (
-            f"the readout time is {share:.3f} of the interval: it scales with --rate, "
-            f"assumed to be {rate:g} Hz"
-        )
+        yield f"the readout time scales with --rate, assumed to be {rate:g} Hz"
+
+
+def _rows(values: Mapping[str, str]) -> Iterator[str]:
+    return (f"{name:26} {text}" for name, text in values.items())
 
 
 def of_lens(found: CameraCalibration) -> Iterator[str]:
     """Yield rows of the lens with its deviations."""
-    state = found.fit.state
+    state, errors = found.fit.state, found.lens
     deviations = np.sqrt(np.diag(found.fit.border_covariance)[1 : 1 + len(state.lens)])
     names = ["fx", "fy", "cx", "cy", *(f"D[{k}]" for k in range(len(state.lens) - 4))]
-    yield f"{'lens':26} {found.fit.camera.distortion_model}"
-    for name, value, deviation in zip(names, state.lens, deviations, strict=True):
-        yield f"{name:26} {value:.5g} +- {found.inflation * deviation:.2g}"
-    errors = found.lens
+    rows = zip(names, state.lens, found.inflation * deviations, strict=True)
+    yield from _rows({"lens": str(found.fit.camera.distortion_model)})
+    yield from _rows({name: f"{value:.5g} +- {spread:.2g}" for name, value, spread in rows})
     if straightness := _straightness(found):
         yield straightness
     yield (
@@ -202,9 +175,9 @@ def of_imu(found: CameraCalibration, imu: ImuRecording, stamp_offset: float) -> 
         yield f"imu: {found.no_mount}"
         return
     offset, spread = 1e3 * (one.time_offset + stamp_offset), 1e3 * one.time_offset_deviation
-    turn = numbers(Rotation.from_matrix(one.mount.camera_from_imu).as_quat(canonical=True), 5)
-    error = numbers(np.degrees(one.rotation_deviations), 3)
-    bias, errors = (numbers(np.degrees(each), 3) for each in (one.mount.bias, one.bias_deviations))
+    turn = _numbers(Rotation.from_matrix(one.mount.camera_from_imu).as_quat(canonical=True), 5)
+    error = _numbers(np.degrees(one.rotation_deviations), 3)
+    bias, errors = (_numbers(np.degrees(each), 3) for each in (one.mount.bias, one.bias_deviations))
     for name, text, known in (
         ("imu.time_offset", f"{offset:+.3f} +- {spread:.3f} ms", one.time_offset_determined),
         (
@@ -212,7 +185,6 @@ def of_imu(found: CameraCalibration, imu: ImuRecording, stamp_offset: float) -> 
             one.rotation_determined,
         ),
         ("gyroscope bias", f"{bias} +- {errors} deg/s", one.bias_determined),
-        ("gyroscope noise", f"{np.degrees(one.noise):.3f} deg/s, {one.samples} samples", True),
     ):  # fmt: skip
         yield f"{name:26} {text if known else f'not observable: {text}'}"
     if one.inflation > 1.0:
@@ -226,15 +198,23 @@ def of_imu(found: CameraCalibration, imu: ImuRecording, stamp_offset: float) -> 
         off = np.degrees(one.mount.turned_from(imu.camera_from_imu))
         chance = _SIGMAS * float(np.degrees(np.linalg.norm(one.rotation_deviations)))
         if off > max(_MOST_TURN, chance):
-            yield f"imu: {_GIVEN} has another rotation, {off:.1f} deg off: is it right?"
+            yield f"imu: TF has another rotation, {off:.1f} deg off: is it right?"
         else:
-            yield f"imu: {_GIVEN} agrees with the rotation to {off:.2f} deg"
-    scales = one.mount.shape[:3]
-    if np.any(np.abs(scales) > np.maximum(_LEAST_SCALE, _SIGMAS * one.shape_deviations[:3])):
-        percent = " ".join(f"{100.0 * scale:+.1f}" for scale in scales)
-        yield f"imu: the gyroscope's scales are {percent} % off (allowed for)"
+            yield f"imu: TF agrees with the rotation to {off:.2f} deg"
 
 
-def numbers(values: Array, digits: int) -> str:
+def of_mount(name: str, first: str, found: Mounted) -> Iterator[str]:
+    """Yield rows of a camera's mount beside the first one of a rig, and of its clock."""
+    mounted, spread = found.extrinsics, found.deviations
+    turn = Rotation.from_matrix(mounted.axes).as_quat(canonical=True)
+    turned, moved = np.degrees(spread[:3]), 1e3 * spread[3:6]
+    yield from _rows({
+        f"{name} <- {first}": f"{_numbers(turn, 5)} (x y z w) +- {_numbers(turned, 3)} deg",
+        f"place in {first}": f"{_numbers(1e3 * mounted.centre, 2)} +- {_numbers(moved, 2)} mm",
+        "offset of its stamps": f"{1e3 * mounted.offset:+.3f} +- {1e3 * spread[6]:.3f} ms",
+    })  # fmt: skip
+
+
+def _numbers(values: Array, digits: int) -> str:
     """Join values (n,) beside each other."""
     return " ".join(f"{value:.{digits}f}" for value in values)

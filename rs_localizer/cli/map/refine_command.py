@@ -11,29 +11,23 @@ from functools import partial
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, earlier_result, refuse_existing, write_all
-from rs_localizer.cli.image_input import LensOptions, given_lens
+from rs_localizer.cli.image_input import LensOptions, given_lens, recorded
 from rs_localizer.cli.map import check_readout
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
-from rs_localizer.cli.settings_args import given_settings, given_topics, given_values
+from rs_localizer.cli.settings_args import given_settings, given_values
 from rs_localizer.io.maps.files import SUFFIX, read_map_file, write_npz
-from rs_localizer.io.topics import IMU
 
 if WORKING:
     import numpy as np
     from tqdm import tqdm
 
-    from rs_localizer.config import NodeConfig
     from rs_localizer.core.arrays import Array
-    from rs_localizer.core.camera import Camera
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.bags import open_bag
     from rs_localizer.io.camera_files import write_calibration
-    from rs_localizer.io.clouds import Correspondences
     from rs_localizer.io.maps.colmap import read_model, write_model
     from rs_localizer.io.maps.landmarks import Map, MapError
     from rs_localizer.offline.image_sources import name_times
-    from rs_localizer.offline.recordings import read_recording
-    from rs_localizer.offline.replay import find_topics
     from rs_localizer.settings import build
     from rs_localizer.tools.mapping.global_shutter import GlobalShutterModel, undo_shutter
     from rs_localizer.tools.mapping.map_keypoints import MapFreedom, RecordedMap, from_recording
@@ -74,7 +68,10 @@ def run(args: Options) -> None:
     config = given_settings(args)
     refuse_existing(args)
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
-    camera, clouds = _recorded(args, config, landmarks)
+    with open_bag(args.recording) as bag:
+        lens, clouds = recorded(args, bag, config, landmarks)
+    axis = config.scan_direction
+    camera = replace(lens, readout_time=config.readout_time, scan_direction=axis)
     with tqdm(total=len(clouds), unit="image", desc="localize", disable=None) as bar:
         localized = from_recording(camera, clouds, landmarks, bar.update)
     deviations = _deviations(args, localized.landmarks, config.map_deviation)
@@ -88,20 +85,6 @@ def run(args: Options) -> None:
     _print_result(localized, refined)
     check_readout(refined.readout_check)
     _write(args, args.out, localized.landmarks, refined)
-
-
-def _recorded(
-    args: Options, config: NodeConfig, landmarks: Map | None
-) -> tuple[Camera, tuple[Correspondences, ...]]:
-    """Return the camera and the correspondences with the map that it saw."""
-    with open_bag(args.recording) as bag:
-        topics = find_topics(bag, given_topics(args)).without(IMU)
-        recorded = read_recording(bag, topics, landmarks)
-    shutter = config.readout_time, config.scan_direction
-    camera = recorded.calibration.camera(*shutter)
-    if lens := given_lens(args):
-        camera = replace(lens, readout_time=shutter[0], scan_direction=shutter[1])
-    return camera, recorded.clouds
 
 
 def _deviations(args: Options, landmarks: Map, map_deviation: float) -> Array | None:

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, refuse_existing, write_all
-from rs_localizer.cli.image_input import ImageOptions, opened, print_left_out, print_times
+from rs_localizer.cli.image_input import ImageOptions, each_image
 from rs_localizer.cli.map import check_readout
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.cli.settings_args import given_settings
@@ -17,14 +17,12 @@ from rs_localizer.markers.families import FAMILIES, Family, family
 
 if WORKING:
     import numpy as np
-    from tqdm import tqdm
 
     from rs_localizer.config import NodeConfig
     from rs_localizer.core.camera import Camera
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.markers.maps import MarkerMap, other_units
     from rs_localizer.markers.prints import Marker
-    from rs_localizer.offline.detect import ImageTally, usable
     from rs_localizer.tools.mapping.survey import MISFIT, Survey, survey
     from rs_localizer.tools.mapping.unknown_markers import Filmed, Spotted, Spotter, every_marker
 
@@ -102,16 +100,11 @@ def _filmed(args: Options, config: NodeConfig, spotter: Spotter) -> Filmed:
     """Return the camera and the markers of each image."""
     spotted = dict[int, Spotted]()
     camera: Camera | None = None
-    with opened(args) as source:
-        tally = ImageTally()
-        seen = usable(source.shots, config.scan_direction, tally)
-        for _, image, own in tqdm(seen, unit="image", desc="detect", disable=None):
-            if camera is not None and own is not camera:
-                raise ValueError("camera_info changes within the recording; cut it there")
-            camera, stamp = own, image.stamp_ns
-            spotted[stamp] = spotter.spot(image.pixels, stamp)
-    print_left_out(tally.refused)
-    print_times(source.clock)
+    for image, own in each_image(args, config.scan_direction):
+        if camera is not None and own is not camera:
+            raise ValueError("camera_info changes within the recording; cut it there")
+        camera, stamp = own, image.stamp_ns
+        spotted[stamp] = spotter.spot(image.pixels, stamp)
     if camera is None:
         raise ValueError(f"{args.recording} has no image that can be read")
     every = [spotted[stamp] for stamp in sorted(spotted)]
