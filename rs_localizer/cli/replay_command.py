@@ -188,7 +188,7 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
                 print(f"the recording has settings of its own: --params {shlex.quote(str(own))}")
             smooth: Smooth | None = None
             if options.smooth:
-                from rs_localizer.tools.smoothed import smooth_frames  # with SciPy
+                from rs_localizer.tools.smoothing import smooth_frames  # with SciPy
 
                 smooth = functools.partial(smooth_frames, localizer, rate=options.pose_rate)
             tally.done = bar.update

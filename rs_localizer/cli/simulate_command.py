@@ -50,17 +50,15 @@ if WORKING:
         shaken,
         simulate_imu,
     )
-    from rs_localizer.tools.simulation.simulated_keypoints import (
-        keypoint_rows,
-        random_descriptors,
-    )
-    from rs_localizer.tools.simulation.simulated_recording import write_simulated
-    from rs_localizer.tools.simulation.simulated_rig import (
+    from rs_localizer.tools.simulation.simulated_recording import (
         camera_stamps,
+        keypoint_rows,
         make_mounts,
+        random_descriptors,
         rig_parameters,
         simulate_rig,
         write_rig_frame,
+        write_simulated,
     )
     from rs_localizer.tools.simulation.true_motion import (
         ConstantVelocity,

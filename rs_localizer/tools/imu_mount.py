@@ -12,8 +12,8 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import REVERSED, ScanDirection
 from rs_localizer.io.imu import ImuRecording
+from rs_localizer.tools.adjust.factors import Gyroscope
 from rs_localizer.tools.adjust.fit import Fit, fit
-from rs_localizer.tools.adjust.gyro import Gyroscope
 from rs_localizer.tools.adjust.spline import Spline, refined
 from rs_localizer.tools.adjust.system import Undetermined
 from rs_localizer.tools.adjust.variables import (

@@ -14,8 +14,11 @@ from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_motions, read_tum
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.simulated_keypoints import keypoint_rows, random_descriptors
-from rs_localizer.tools.simulation.simulated_recording import write_simulated
+from rs_localizer.tools.simulation.simulated_recording import (
+    keypoint_rows,
+    random_descriptors,
+    write_simulated,
+)
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 
 FRAMES = 8

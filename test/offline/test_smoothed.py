@@ -16,7 +16,7 @@ from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Localized
 from rs_localizer.offline.replay import find_topics, find_transforms, replay
 from rs_localizer.pipeline.camera_frames import CameraFrames
-from rs_localizer.tools.smoothed import smooth_frames
+from rs_localizer.tools.smoothing import smooth_frames
 
 CONFIG = NodeConfig(readout_time=0.03)
 Recorded = tuple[CameraFrames, list[Localized], list[int]]

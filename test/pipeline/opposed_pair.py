@@ -17,7 +17,7 @@ from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import write_parameters
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import simulate_frames
-from rs_localizer.tools.simulation.simulated_rig import (
+from rs_localizer.tools.simulation.simulated_recording import (
     RigFrame,
     camera_stamps,
     make_mounts,

@@ -12,10 +12,15 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.tools.adjust.bodies import Pieces, paper_covariance
-from rs_localizer.tools.adjust.gyro import Gyroscope
+from rs_localizer.tools.adjust.factors import (
+    Floating,
+    Gyroscope,
+    acceleration_rows,
+    block_rows,
+    known,
+    rest_rows,
+)
 from rs_localizer.tools.adjust.intrinsics import lens_prior
-from rs_localizer.tools.adjust.motion import acceleration_rows, rest_rows
-from rs_localizer.tools.adjust.priors import Floating, block_rows, known
 from rs_localizer.tools.adjust.reprojection import LIMIT, Reprojection
 from rs_localizer.tools.adjust.row_kernels import EXTRINSICS, Curve, Projections
 from rs_localizer.tools.adjust.spline_kernels import CONTROL

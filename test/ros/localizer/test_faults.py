@@ -30,7 +30,7 @@ from rs_localizer.io.outputs import TYPES
 from rs_localizer.ros.localizer.node import LocalizerNode
 from rs_localizer.ros.node.conversion import make_message
 from rs_localizer.ros.node.managed import spin
-from rs_localizer.tools.simulation.simulated_keypoints import random_descriptors
+from rs_localizer.tools.simulation.simulated_recording import random_descriptors
 
 from ..conftest import TIMEOUT, Peer  # noqa: TID252 - Python has a package "test"
 from .robot import READOUT_TIME, Robot, inputs, record, tf2_ros

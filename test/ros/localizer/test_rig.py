@@ -15,7 +15,7 @@ from rs_localizer.io.bags import open_bag
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.ros.node.conversion import copy_message, make_message, message_class
-from rs_localizer.tools.simulation.simulated_rig import RIG_FRAME, optical_frame
+from rs_localizer.tools.simulation.simulated_recording import RIG_FRAME, optical_frame
 
 from ...pipeline.opposed_pair import PARTS, record  # noqa: TID252 - Python has a package "test"
 from ..conftest import TIMEOUT  # noqa: TID252

@@ -11,9 +11,13 @@ from dense import are_derivatives, fitting, normal_of
 from test_fit import READOUT, make_camera
 
 from rs_localizer.core import so3
-from rs_localizer.tools.adjust.gyro import Gyroscope
-from rs_localizer.tools.adjust.motion import acceleration_rows, rest_rows
-from rs_localizer.tools.adjust.priors import Floating, block_rows
+from rs_localizer.tools.adjust.factors import (
+    Floating,
+    Gyroscope,
+    acceleration_rows,
+    block_rows,
+    rest_rows,
+)
 from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.spline import Layout, Spline
 from rs_localizer.tools.adjust.system import Factored, Quadratic, System

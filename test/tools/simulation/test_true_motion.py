@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.tools.simulation.simulated_imu import shaken
-from rs_localizer.tools.simulation.simulated_rig import MountedMotion
+from rs_localizer.tools.simulation.simulated_recording import MountedMotion
 from rs_localizer.tools.simulation.simulated_settings import BODY_FROM_CAMERA
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity, RecordedMotion, TrueMotion
 
