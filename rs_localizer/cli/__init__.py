@@ -5,6 +5,10 @@
 from __future__ import annotations
 
 import importlib
+import os
+import shlex
+import shutil
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -101,3 +105,27 @@ def stage(name: str, total: int) -> Iterator[Callable[[int], object]]:
     """Show a progress bar to a person who waits, and none in a log; yield what counts."""
     with tqdm(total=total, desc=name, disable=None) as bar:
         yield bar.update
+
+
+def typed(executable: str, *words: str) -> str:
+    """Return the command line that runs an executable of this package here, to be pasted.
+
+    After ``make`` the executables are not in PATH.
+    """
+    return shlex.join([*_program(executable), *words])
+
+
+def _program(executable: str) -> list[str]:
+    in_path = shutil.which(executable)
+    # Look beside the running program, or, for ``python -m rs_localizer``, beside Python.
+    for program in (sys.argv[0], sys.executable):
+        beside = Path(os.path.abspath(program)).with_name(executable)
+        if not shutil.which(str(beside)):
+            continue
+        if in_path is not None and Path(in_path).samefile(beside):
+            return [executable]
+        here = Path.cwd()
+        return [str(beside.relative_to(here) if beside.is_relative_to(here) else beside)]
+    if in_path is not None or executable != "rs_localizer":
+        return [executable]
+    return [sys.executable, "-m", "rs_localizer"]

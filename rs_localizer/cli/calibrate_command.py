@@ -13,13 +13,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, refuse_existing, write_all
-from rs_localizer.cli.image_input import ImageOptions, each_image, recorded
-from rs_localizer.cli.marker_map import TargetOptions, find_map
+from rs_localizer.cli import WORKING, refuse_existing, typed, write_all
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
-from rs_localizer.cli.rig_input import cameras_of, check_there
+from rs_localizer.cli.recording_input import (
+    ImageOptions,
+    TargetOptions,
+    cameras_of,
+    check_there,
+    each_image,
+    find_map,
+    recorded,
+)
 from rs_localizer.cli.settings_args import given_settings, remapped
-from rs_localizer.cli.typed import typed
 from rs_localizer.io.topics import CAMERA_INFO, IMAGE, IMU
 
 if WORKING:

@@ -14,9 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, detect_command, import_ros, simulate_command, stage
+from rs_localizer.cli import WORKING, detect_command, import_ros, simulate_command, stage, typed
 from rs_localizer.cli.options import option
-from rs_localizer.cli.typed import typed
 from rs_localizer.config import NodeConfig
 
 if WORKING:

@@ -11,18 +11,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, earlier_result
-from rs_localizer.cli.image_input import (
+from rs_localizer.cli import WORKING, earlier_result, typed
+from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
+from rs_localizer.cli.recording_input import (
     ImageOptions,
+    TargetOptions,
+    cameras_of,
+    find_map,
     opened,
     print_left_out,
     print_times,
     shutter_values,
 )
-from rs_localizer.cli.marker_map import TargetOptions, find_map
-from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
-from rs_localizer.cli.rig_input import cameras_of
-from rs_localizer.cli.typed import typed
 from rs_localizer.config import DetectorConfig, FeatureConfig, FeatureKind
 from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.recording import PARAMETERS

@@ -13,8 +13,8 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from rs_localizer.cli import WORKING, earlier_result, refuse_existing
-from rs_localizer.cli.image_input import ImageOptions
 from rs_localizer.cli.options import FleetOptions, ResultOptions, UsageError, argument, option
+from rs_localizer.cli.recording_input import ImageOptions
 from rs_localizer.cli.settings_args import given_topics, given_values
 from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import is_bag, open_bag

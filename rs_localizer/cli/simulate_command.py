@@ -10,9 +10,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, earlier_result
+from rs_localizer.cli import WORKING, earlier_result, typed
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
-from rs_localizer.cli.typed import typed
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.camera_files import pinhole_matrix, read_calibration

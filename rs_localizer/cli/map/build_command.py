@@ -10,23 +10,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from rs_localizer.cli import WORKING, earlier_result, stage
-from rs_localizer.cli.image_input import (
+from rs_localizer.cli import WORKING, earlier_result, stage, typed
+from rs_localizer.cli.options import ResultOptions, UsageError, argument, number, option
+from rs_localizer.cli.recording_input import (
     ImageOptions,
+    check_there,
     opened,
     print_left_out,
     print_times,
     shutter_values,
 )
-from rs_localizer.cli.options import ResultOptions, UsageError, argument, number, option
-from rs_localizer.cli.rig_input import check_there
-from rs_localizer.cli.typed import typed
 from rs_localizer.config import FeatureConfig
 
 if WORKING:
     from tqdm import tqdm
 
-    from rs_localizer.cli.marker_map import read_checked_map
+    from rs_localizer.cli.recording_input import read_checked_map
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.camera_files import lens_parameters
     from rs_localizer.io.maps.files import write_npz

@@ -11,9 +11,9 @@ from functools import partial
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, earlier_result, refuse_existing, write_all
-from rs_localizer.cli.image_input import LensOptions, given_lens, recorded
 from rs_localizer.cli.map import check_readout
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
+from rs_localizer.cli.recording_input import LensOptions, given_lens, recorded
 from rs_localizer.cli.settings_args import given_settings, given_values
 from rs_localizer.io.maps.files import SUFFIX, read_map_file, write_npz
 

@@ -9,9 +9,9 @@ from functools import partial
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, refuse_existing, write_all
-from rs_localizer.cli.image_input import ImageOptions, each_image
 from rs_localizer.cli.map import check_readout
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
+from rs_localizer.cli.recording_input import ImageOptions, each_image
 from rs_localizer.cli.settings_args import given_settings
 from rs_localizer.markers.families import FAMILIES, Family, family
 

@@ -1,16 +1,18 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Images that a command takes: a video, a folder, or a bag; their camera and their times."""
+"""Inputs of commands: images or a bag, their camera or cameras, and the targets in them."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from rs_localizer.cli import WORKING
+from rs_localizer.cli import WORKING, read_counts
 from rs_localizer.cli.options import SettingOptions, TopicOptions, UsageError, option
 from rs_localizer.cli.settings_args import given_topics, given_values, remapped
 from rs_localizer.io.camera_files import CALIBRATION_KINDS, read_calibration
@@ -21,6 +23,7 @@ from rs_localizer.pipeline.inputs import CAMERA_INFO_TYPE, IMAGE_TYPES
 from rs_localizer.settings import camera_values
 
 if WORKING:
+    import numpy as np
     from tqdm import tqdm
 
     from rs_localizer.config import NodeConfig
@@ -30,6 +33,10 @@ if WORKING:
     from rs_localizer.io.images import Image
     from rs_localizer.io.maps.landmarks import Map
     from rs_localizer.io.video import has_times
+    from rs_localizer.markers.map_files import read_marker_map
+    from rs_localizer.markers.maps import MarkerMap, other_units
+    from rs_localizer.markers.poses import Pose
+    from rs_localizer.markers.prints import Chessboard
     from rs_localizer.offline.detect import ImageTally, usable
     from rs_localizer.offline.image_sources import (
         Carried,
@@ -40,8 +47,8 @@ if WORKING:
         image_files,
         name_times,
     )
-    from rs_localizer.offline.recordings import read_recording
-    from rs_localizer.offline.replay import find_topics
+    from rs_localizer.offline.recordings import optical_frame, read_recording
+    from rs_localizer.offline.replay import camera_topics, find_topics
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,3 +182,105 @@ def recorded(
     topics = find_topics(bag, given_topics(args)).without(IMU)
     found = read_recording(bag, topics, landmarks)
     return given_lens(args) or found.calibration.camera(0.0, config.scan_direction), found.clouds
+
+
+T = TypeVar("T", bound=LensOptions)
+
+
+def check_there(recordings: Sequence[Path]) -> None:
+    """Raise ValueError for one that does not exist, before any other has been read."""
+    for path in recordings:
+        if not path.exists():
+            raise ValueError(f"{path} does not exist")
+
+
+def cameras_of(args: T, recordings: Sequence[Path], config: NodeConfig) -> dict[str, tuple[T, str]]:
+    """Return the cameras of one bag, or of a recording of each, by name.
+
+    Of each: the options of a recording of this camera alone, and the frame of its optical axes.
+    """
+    found: list[tuple[str, dict[str, Any], str]]
+    if len(recordings) > 1:
+        found = [
+            (re.sub(r"\W", "_", path.stem, flags=re.ASCII), {"recording": path}, "")
+            for path in recordings
+        ]
+    else:
+        found = _in_one_bag(recordings[0], config.cameras if config.of_cameras else None)
+    names = [name for name, _, _ in found]
+    if len(set(names)) < max(len(names), 2) or not all(name[:1].isalpha() for name in names):
+        raise UsageError(
+            f"--rig: cameras need different names that begin with a letter: {', '.join(names)}"
+        )
+    check_there(recordings)
+    # Single recordings that were put together have one frame.
+    differ = len({frame for _, _, frame in found}) == len(found)
+    cameras, lens = {}, args.calibration
+    for name, own, frame in found:
+        calibration = None if lens is None else lens.with_name(f"{lens.name}#{name}")
+        alone = replace(args, **own, calibration=calibration)
+        cameras[name] = alone, (differ and frame) or f"{name}_optical_frame"
+    return cameras
+
+
+def _in_one_bag(path: Path, given: Sequence[str] | None) -> list[tuple[str, dict[str, Any], str]]:
+    """Return name, topics as options, and frame of each camera of a bag."""
+    if not is_bag(path):
+        raise UsageError(f"--rig needs the recordings of several cameras, or one bag; got {path}")
+    with open_bag(path) as bag:
+        return [
+            (
+                name,
+                {"recording": path, "remaps": [f"{it}:={topic}" for it, topic in own.items()]},
+                optical_frame(bag, own["camera_info"]),
+            )
+            for name, own in camera_topics(bag, given).items()
+        ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TargetOptions:
+    """what to look for: a map of markers, or one board."""
+
+    map: Path | None = option("marker map; also that of keypoints, where they are read", "FILE")
+    board: str | None = option("instead: inner corners along a row x rows of a chessboard", "6x4")
+    square: float | None = option(
+        "side of its squares in metres", "M", above=0.0
+    )  # fmt: skip
+
+
+def read_checked_map(path: Path) -> MarkerMap:
+    """Read the map of a file, and warn of sizes in other units."""
+    marker_map = read_marker_map(path)
+    for fault in other_units(marker_map):
+        print(f"warning: {path}: {fault}", file=sys.stderr)
+    return marker_map
+
+
+def find_map(args: TargetOptions) -> MarkerMap:
+    """Return the given map, or the map of the given board.
+
+    Raises:
+        UsageError: when it is neither, or both.
+    """
+    if (args.map is None) == (args.board is None):
+        raise UsageError("give either --map or --board")
+    if args.map is not None:
+        if args.square is not None:
+            raise UsageError("--square goes with --board")
+        return read_checked_map(args.map)
+    if args.board is None or args.square is None:
+        raise UsageError("--board needs --square")
+    columns, rows = read_counts(args.board, "--board")
+    try:
+        board = Chessboard(columns, rows, args.square)
+    except ValueError as error:
+        raise UsageError(f"--board: {error}") from error
+    # A board on its own is the map: its first corner is the origin, x along the rows, y from row to
+    # row, z away from the viewer.
+    axes = np.diag([1.0, -1.0, -1.0])
+    pose = Pose(-axes @ board.points[0], axes)
+    marker_map = MarkerMap(boards=(replace(board, pose=pose),))
+    for fault in other_units(marker_map):
+        raise UsageError(f"--square: {fault}")
+    return marker_map
