@@ -17,7 +17,7 @@ from rs_localizer.tools.printing import PAGES, largest_side, page_files, plan, w
 if WORKING:
     from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.markers.map_files import write_marker_map
-    from rs_localizer.markers.maps import MarkerMap, other_units, wall
+    from rs_localizer.markers.maps import MarkerMap, wall
     from rs_localizer.markers.poses import Pose
     from rs_localizer.markers.prints import Charuco, Chessboard
 
@@ -59,8 +59,6 @@ def run(options: Options) -> dict[str, object]:
         marker_map = _map(options)
     except ValueError as error:  # the options are all that can be wrong with it
         raise UsageError(str(error)) from error
-    for fault in other_units(marker_map):
-        raise UsageError(fault)
     prints = options.out if options.out.suffix in (".pdf", ".png") else Path(f"{options.out}.pdf")
     pages = plan(marker_map, options.page)
     written = (*page_files(prints, len(pages)), prints.with_suffix(".yaml"))

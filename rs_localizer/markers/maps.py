@@ -131,27 +131,3 @@ def wall(
         place = Pose(pose(offset[None])[0], pose.rotation)
         made.append(Marker.at(family_name, first_id + index, size, place))
     return tuple(made)
-
-
-# A marker this many times larger than the median has its size in another unit, and so have all of
-# them if they are larger than any that is printed (m); so have squares of boards.
-_OTHER_UNIT, _LARGEST, _LARGEST_SQUARE = 20.0, 5.0, 2.0
-
-
-def other_units(marker_map: MarkerMap) -> Iterator[str]:
-    """Yield sentences on sizes that seem not to be in metres."""
-    for board in marker_map.boards:
-        if (large := board.square) > _LARGEST_SQUARE:
-            yield (
-                f"{board.name} with {large:g} m from corner to corner: sizes are in metres; "
-                f"{1e-3 * large:g} would be {large:g} mm"
-            )
-    usual = float(np.median([marker.size for marker in marker_map.markers] or [0.0]))
-    if usual > _LARGEST:
-        yield f"markers of {usual:g} m: are sizes and positions, given in metres, in another unit?"
-    for marker in marker_map.markers:
-        if not usual / _OTHER_UNIT <= marker.size <= usual * _OTHER_UNIT:
-            yield (
-                f"{marker.name} has a size of {marker.size:g} m, where {usual:g} m is usual: "
-                "is it in another unit?"
-            )

@@ -25,6 +25,9 @@ _MOST_SQUARES = 200
 # from the middle: 0.2 mm in 10 cm, as paper on a wall or a clipboard bends.
 _PAPER = 0.002
 
+# m: what is longer was given in millimetres.
+_LONGEST = 10.0
+
 _UNIT_SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 
 
@@ -242,5 +245,5 @@ def _square_pose(corners: Array) -> Pose:
 
 
 def _positive(value: float, name: str) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:
-        raise ValueError(f"{name} must be a length in metres above 0, found {value!r}")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= _LONGEST:
+        raise ValueError(f"{name} must lie above 0 and up to {_LONGEST:g} metres, found {value!r}")

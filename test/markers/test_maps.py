@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.markers.boards import flat_misfit
 from rs_localizer.markers.families import FAMILIES, family
 from rs_localizer.markers.map_files import read_any, read_marker_map, write_marker_map
-from rs_localizer.markers.maps import MarkerMap, MarkerMapError, other_units, wall
+from rs_localizer.markers.maps import MarkerMap, MarkerMapError, wall
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Charuco, Chessboard, Marker
 
@@ -199,24 +199,12 @@ def test_deviations_of_a_survey_are_kept(tmp_path):
         read_any(as_file(tmp_path, broken))
 
 
-def marker(id_: int, x: float, size: float = 0.1) -> Marker:
-    return Marker.at("4x4_50", id_, size, Pose(np.array([x, 0.0, 0.0])))
-
-
-@pytest.mark.parametrize(
-    ("markers", "boards", "text"),
-    [
-        ([marker(k, 0.5 * k) for k in range(3)] + [marker(3, 9.0, 4.0)], [], "another unit"),
-        (
-            [],
-            [Charuco(5, 7, 30.0, 20.0, family("5x5_50"))],
-            "30 m from corner to corner: sizes are",
-        ),
-    ],
-)
-def test_sizes_in_other_units(markers, boards, text):
-    (found,) = other_units(MarkerMap(tuple(markers), tuple(boards)))
-    assert text in found
+@pytest.mark.parametrize("make", [
+    lambda: Marker.at("4x4_50", 0, 100.0), lambda: Charuco(5, 7, 30.0, 20.0, family("5x5_50")),
+])  # fmt: skip
+def test_sizes_in_millimetres(make):
+    with pytest.raises(ValueError, match="up to 10 metres"):
+        make()
 
 
 def test_corners_in_another_order_fit_no_homography():

@@ -31,6 +31,7 @@ if WORKING:
     from rs_localizer.io.maps.files import write_npz
     from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME
     from rs_localizer.io.trajectories import Trajectory, write_tum
+    from rs_localizer.markers.map_files import read_marker_map
     from rs_localizer.settings import build, write_camera_file
     from rs_localizer.tools.mapping.anchors import Anchors, Distance, PointSight
     from rs_localizer.tools.mapping.build import Built, Given, build_map
@@ -95,7 +96,7 @@ def run(args: Options) -> None:
     distances = _distances(args, [name for name, *_ in points])
     require()
     check_there([args.recording])
-    markers = None if args.markers is None else read_checked_map(args.markers)
+    markers = None if args.markers is None else read_marker_map(args.markers)
     shutter, frame = shutter_of(args), MAP_FRAME if markers is None else markers.map_frame
     with atomic_directory(args.out, earlier_result(args, MAP)) as out:
         out.mkdir()

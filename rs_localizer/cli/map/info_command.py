@@ -19,7 +19,7 @@ if WORKING:
 
     from rs_localizer.io.maps.landmarks import Map
     from rs_localizer.markers.families import family
-    from rs_localizer.markers.maps import MarkerMap, other_units
+    from rs_localizer.markers.maps import MarkerMap
 
 Figures = dict[str, Any]
 """Printed figures, and those of ``--json``: identifiers, with their units."""
@@ -40,10 +40,7 @@ class Options:
 
 def run(options: Options) -> Figures:
     any_map, kind = read(options)
-    figures = describe(options.file, any_map, kind)
-    if isinstance(any_map, MarkerMap) and (faults := list(other_units(any_map))):
-        raise ValueError(f"{options.file}: {'; '.join(faults)}")
-    return figures
+    return describe(options.file, any_map, kind)
 
 
 def read(options: Options) -> tuple[Map | MarkerMap, str]:

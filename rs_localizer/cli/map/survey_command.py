@@ -21,7 +21,7 @@ if WORKING:
     from rs_localizer.config import NodeConfig
     from rs_localizer.core.camera import Camera
     from rs_localizer.markers.map_files import write_marker_map
-    from rs_localizer.markers.maps import MarkerMap, other_units
+    from rs_localizer.markers.maps import MarkerMap
     from rs_localizer.markers.prints import Marker
     from rs_localizer.tools.mapping.survey import MISFIT, Survey, survey
     from rs_localizer.tools.mapping.unknown_markers import Filmed, Spotted, Spotter, every_marker
@@ -65,8 +65,6 @@ def run(args: Options) -> None:
     surveyed = tuple(replace(marker, deviations=deviations) for marker, deviations in pairs)
     marker_map = MarkerMap(surveyed)
     write_all({args.out: partial(write_marker_map, marker_map=marker_map)})
-    for text in other_units(marker_map):
-        print(f"warning: {text}")
 
 
 def _markers(args: Options) -> tuple[Marker, ...]:
