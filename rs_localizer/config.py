@@ -510,6 +510,18 @@ class NodeConfig(LocalizerConfig):
         if self.saved_pose_file and self.tf_rate == 0.0:  # as its timer saves, and starts
             raise ValueError("saved_pose_file needs a tf_rate above 0")
 
+    @property
+    def shutters(self) -> Mapping[str, CameraSettings]:
+        """The shutter of each camera and its stamps; of one without a name: ``""``."""
+        own = CameraSettings(self.readout_time, self.scan_direction, self.stamp_offset)
+        return self.of_cameras or {"": own}
+
+    @property
+    def is_timed(self) -> bool:
+        """True if frames tell velocities; without a readout time they predict nothing."""
+        rolling = SOLVERS[self.solver].rolling_shutter
+        return rolling and all(own.readout_time > 0.0 for own in self.shutters.values())
+
     def _check_cameras(self) -> None:
         if self.cameras == NO_NAMES:
             return

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from rs_localizer.config import Imu, ImuUse, NodeConfig
+from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import ImuReason, Unused
 from rs_localizer.core.types import Estimate, Failure
@@ -264,18 +264,6 @@ class AidInput:
         if self._in_a_row.count(unused.reason) == _LONG and self._reported != unused.reason:
             self._reported = unused.reason
             self._notice(unused.reason, f"the IMU is not used: {in_words(unused)}")
-
-
-def without_wait(config: NodeConfig) -> NodeConfig:
-    """Return the settings that results depend on: of an IMU that is not used, nothing."""
-    unused = config.of_cameras or config.imu.use == ImuUse.NONE
-    imu = Imu(use=ImuUse.NONE) if unused else replace(config.imu, wait=0.0)
-    return replace(config, imu=imu)
-
-
-def without_aid(config: NodeConfig) -> NodeConfig:
-    """Return the settings without an IMU."""
-    return replace(config, imu=replace(config.imu, use=ImuUse.NONE))
 
 
 def aid_of(config: NodeConfig, camera: Camera) -> Aid | None:

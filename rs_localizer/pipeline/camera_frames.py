@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,14 +26,19 @@ from rs_localizer.io.clouds import (
     read_keypoints,
 )
 from rs_localizer.io.outputs import Localized
+from rs_localizer.io.transforms import Transforms
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline import what_fits
 from rs_localizer.pipeline.aid import Moment, aid_of
 from rs_localizer.pipeline.cloud_checks import moved_landmarks, stale_landmarks
-from rs_localizer.pipeline.frames import FrameLocalizer, is_timed
+from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.given_pose import GivenPose, PosePrior
 from rs_localizer.pipeline.pose_at_time import PublishedMoment, middle_row_ns, published_moment
-from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
+from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unheard
 from rs_localizer.tracking import FrameContext, Tracker
+
+if TYPE_CHECKING:
+    from rs_localizer.pipeline.tags import Tags
 
 # From this chance on of a wrong pose or map, it is more probable than not.
 DOUBTFUL = 0.5
@@ -42,9 +47,34 @@ DOUBTFUL = 0.5
 class CameraFrames(FrameLocalizer):
     """Localizes the frames of one camera, without a name; see :class:`FrameLocalizer`."""
 
+    def __init__(
+        self, config: NodeConfig, notice: Notify = unheard, transforms: Transforms | None = None
+    ) -> None:
+        self._tags: Tags | None = None
+        self._pose_prior = PosePrior(notice)
+        super().__init__(config, notice, transforms)
+
+    def load_files(self) -> None:
+        """Use ``camera_file``, ``map_file`` and ``marker_map`` of the settings, if any."""
+        super().load_files()
+        if self.config.marker_map:  # others need no detector
+            from rs_localizer.pipeline.tags import read_tags
+
+            self._tags = read_tags(self.config.marker_map, self._notice)
+
+    @property
+    def map_points(self) -> Array | None:
+        return super().map_points if self._tags is None else self._tags.corners
+
+    def give_pose(self, given: GivenPose) -> None:
+        """Find the next frame near this pose; one that a user gives ends the track."""
+        self._pose_prior.take_pose(given)
+        if not given.lasts:
+            self._forget_motion()
+
     def _new_tracker(self, config: NodeConfig, cameras: Mapping[str, Camera]) -> Tracker:
         (camera,) = cameras.values()
-        timed = is_timed(config, cameras)
+        timed = config.is_timed
         tracks = config.tracking and timed
         aid = aid_of(config, camera) if timed else None
         lag = config.output_lag if tracks else 0

@@ -17,15 +17,22 @@ _FINE = 0.00097
 _SLACK = 1.0
 
 
-def oddities(cloud: Correspondences, camera: Camera, camera_frame: str) -> dict[Notice, str]:
+def oddities(
+    cloud: Correspondences, camera: Camera, camera_frame: str, most: int
+) -> dict[Notice, str]:
     """Return sentences on what is odd about a cloud, by notice.
 
     Args:
         cloud: of one image.
         camera: that ``camera_info`` describes.
         camera_frame: its optical frame.
+        most: points that are used.
     """
     notices: dict[Notice, str] = {}
+    if (count := len(cloud.points)) > most:
+        notices[Notice.TOO_MANY_POINTS] = (
+            f"{count} points have come; max_points of them, {most}, are used"
+        )
     if cloud.frame == camera_frame:
         notices[Notice.MAP_IS_CAMERA] = (
             f"the points are given in {cloud.frame!r}, which is the camera's own frame: "

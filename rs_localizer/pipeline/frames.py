@@ -12,16 +12,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 import numpy as np
 
 from rs_localizer.config import (
-    CameraSettings,
     NodeConfig,
-    PublishTf,
-    RefinementKind,
 )
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -34,42 +30,22 @@ from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import CAMERA_INFO, MAP_POINTS
 from rs_localizer.io.transforms import Transforms, TransformTree
 from rs_localizer.pipeline import what_fits
-from rs_localizer.pipeline.aid import AidInput, without_aid, without_wait
+from rs_localizer.pipeline.aid import AidInput
 from rs_localizer.pipeline.cloud_checks import oddities
-from rs_localizer.pipeline.given_pose import GivenPose, PosePrior
+from rs_localizer.pipeline.in_effect import in_effect, of_estimates
 from rs_localizer.pipeline.keypoint_map import Landmarks, read_landmarks
-from rs_localizer.pipeline.pose_at_time import PublishedMoment, pose_at, twist_at, with_timing
+from rs_localizer.pipeline.pose_at_time import PublishedMoment, published_motion
 from rs_localizer.pipeline.published import is_mounting_late, of_body
 from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
 from rs_localizer.pipeline.stream import Stream
 from rs_localizer.shutter_watch import ShutterWatch
-from rs_localizer.solvers.table import find_solver
 from rs_localizer.tracking import Tracker
-
-if TYPE_CHECKING:
-    from rs_localizer.pipeline.tags import Tags
 
 ANY_CALIBRATION = Calibration(
     "camera", 640, 480, (500.0, 0.0, 319.5, 0.0, 500.0, 239.5, 0.0, 0.0, 1.0), (), "plumb_bob",
     (1, 1), None,
 )  # fmt: skip
 """Stands in until the first camera_info: settings are checked before it."""
-
-
-# Settings that change what is made of an estimate, or which points come to it, and not how it is
-# made. All others start the track afresh.
-_BESIDE = frozenset({
-    "readout_time_deviation", "pose_time", "max_points", "base_frame",
-    "odom_frame", "publish_tf", "tf_rate", "hold", "two_d_mode",
-    "transform_tolerance", "saved_pose_file", "map_file", "map_frame", "marker_map",
-    "autostart", "output_rate", "camera_file",
-})  # fmt: skip
-
-
-def _of_estimates(config: NodeConfig) -> tuple[object, ...]:
-    rig = config.rig if config.of_cameras else type(config.rig)()
-    config = replace(without_wait(config), rig=rig)
-    return tuple(getattr(config, it.name) for it in fields(config) if it.name not in _BESIDE)
 
 
 class FrameLocalizer(ABC):
@@ -98,12 +74,9 @@ class FrameLocalizer(ABC):
         self.calibrations: dict[str, Calibration] = {}
         """What the last usable camera_info of each camera said; of one without a name: ``""``."""
         self._landmarks = Landmarks(notice)
-        self._tags: Tags | None = None
         self._lenses: dict[str, Camera] = {}  # of camera_file
         self._stream = Stream(notice, self._forget_motion)
-        self._pose_prior = PosePrior(notice)
-        self._too_many = False  # whether clouds above max_points have been noticed
-        self._config = _in_effect(config)
+        self._config = in_effect(config)
         self._apply_settings(self._config)
 
     @abstractmethod
@@ -128,8 +101,8 @@ class FrameLocalizer(ABC):
         What no frame's estimate depends on, as of outputs and transforms, leaves track, aid and
         shutter watch as they are.
         """
-        config = _in_effect(config)
-        if _of_estimates(config) == _of_estimates(self._config):
+        config = in_effect(config)
+        if of_estimates(config) == of_estimates(self._config):
             self._config = config
             return False
         self._apply_settings(config)
@@ -141,7 +114,7 @@ class FrameLocalizer(ABC):
             name: self.calibrations.get(name, ANY_CALIBRATION).camera(
                 own.readout_time, own.scan_direction
             )
-            for name, own in shutters(config).items()
+            for name, own in config.shutters.items()
         }
         self._tracker = self._new_tracker(config, cameras)
         self._cameras, self._config = cameras, config
@@ -174,9 +147,7 @@ class FrameLocalizer(ABC):
     @property
     def map_points(self) -> Array | None:
         """Landmarks (n,3), or corners (n,4,3) of markers; None: correspondences bring their own."""
-        if self.map is not None:
-            return self.map.points
-        return None if self._tags is None else self._tags.corners
+        return None if self.map is None else self.map.points
 
     @property
     def shutter(self) -> ShutterWatch:
@@ -203,7 +174,7 @@ class FrameLocalizer(ABC):
             calibration = calibration.with_lens(self._lenses[name])
         if calibration == before:  # drivers repeat it with every image
             return
-        own = shutters(self._config)[name]
+        own = self._config.shutters[name]
         self._cameras[name] = calibration.camera(own.readout_time, own.scan_direction)
         self._use_camera(name, calibration)
         if before is not None:
@@ -236,7 +207,7 @@ class FrameLocalizer(ABC):
         return config.transform_tolerance if late else 0.0
 
     def load_files(self) -> None:
-        """Use ``camera_file`` and the maps ``map_file`` and ``marker_map`` of the settings, if any.
+        """Use ``camera_file`` and the map ``map_file`` of the settings, if any.
 
         Raises:
             ValueError: for a file that cannot be read or holds no such map.
@@ -246,22 +217,12 @@ class FrameLocalizer(ABC):
 
             for name in self.config.cameras:
                 self._lenses[name] = read_calibration(f"{file}#{name}" if name else file)
-        if self.config.marker_map:  # others need no detector
-            from rs_localizer.pipeline.tags import read_tags
-
-            self._tags = read_tags(self.config.marker_map, self._notice)
         if self.config.map_file:
             self.use_map(read_landmarks(self.config.map_file, self.config.map_frame))
 
     def use_map(self, landmarks: Map) -> None:
         """Match keypoints with this map from the next frame on."""
         self._landmarks.use_map(landmarks)
-
-    def give_pose(self, given: GivenPose) -> None:
-        """Find the next frame near this pose; one that a user gives ends the track."""
-        self._pose_prior.take_pose(given)
-        if not given.lasts:
-            self._forget_motion()
 
     def _result(
         self, cloud: Correspondences, estimate: Estimate, moment: PublishedMoment,
@@ -275,23 +236,15 @@ class FrameLocalizer(ABC):
             moment: for which they are valid.
             deviation: s, of the readout time.
         """
-        config, readout_time, (stamp_ns, tau, there) = self._config, estimate.span, moment
-        moving = readout_time > 0.0 and find_solver(config.solver).rolling_shutter
-        if self.shutter.is_global and not estimate.aided:
-            moving = False  # an image says nothing of velocities
-        motion, at = (estimate, tau) if there is None else (there, 0.0)
-        pose = pose_at(motion, at)
-        twist = twist_at(motion, at, readout_time) if moving else None
-        if twist is not None and deviation > 0.0:
-            # The middle row comes later where the readout takes longer; the first one does not.
-            first = next(iter(self._cameras.values())).first_row_time
-            delay, share = deviation * first * (tau == 0.0), deviation / readout_time
-            pose, twist = with_timing(pose, twist, share, delay, config.acceleration)
+        pose, twist = published_motion(
+            estimate, moment, self._config, next(iter(self._cameras.values())), deviation,
+            self.shutter.is_global,
+        )  # fmt: skip
         seen = np.asarray(estimate.inliers) if len(cloud.table) else np.zeros(0, np.bool_)
         return self.mounted(
             Localized(
                 input_stamp_ns=cloud.stamp_ns,
-                stamp_ns=stamp_ns,
+                stamp_ns=moment.stamp_ns,
                 map_frame=cloud.frame,
                 body_frame=self.camera_frame,
                 pose=pose,
@@ -308,16 +261,10 @@ class FrameLocalizer(ABC):
 
     def _checked(self, cloud: Correspondences, name: str = "") -> Correspondences:
         """Return at most a camera's part of ``max_points``, and give notice of what is odd."""
-        camera, of = self._cameras[name], f"{name}: " if name else ""
-        for notice, text in oddities(cloud, camera, self.calibrations[name].frame).items():
-            self._notice(notice, of + text)
-        most = self.config.max_points // len(self._cameras)
-        if len(cloud.points) > most and not self._too_many:
-            self._too_many = True
-            self._notice(
-                Notice.TOO_MANY_POINTS,
-                f"{of}{len(cloud.points)} points have come; max_points of them, {most}, are used",
-            )
+        camera, most = self._cameras[name], self.config.max_points // len(self._cameras)
+        odd = oddities(cloud, camera, self.calibrations[name].frame, most)
+        for notice, text in odd.items():
+            self._notice(notice, f"{name}: {text}" if name else text)
         return thin_cloud(cloud, most, camera.size)
 
     def _explained(
@@ -331,29 +278,3 @@ class FrameLocalizer(ABC):
             return refusal
         self._notice(notice, said)
         return replace(refusal, detail=f"{refusal.detail}; {said}")
-
-
-def _in_effect(config: NodeConfig) -> NodeConfig:
-    """Return the settings without what ``refinement`` turns off.
-
-    That is what knows more than a frame's points, and TF where no covariance says how good a pose
-    is.
-    """
-    if config.refinement == RefinementKind.FULL:
-        return config
-    config = replace(without_aid(config), tracking=False)
-    if config.refinement == RefinementKind.NONE:
-        config = replace(config, publish_tf=PublishTf.NONE)
-    return config
-
-
-def shutters(config: NodeConfig) -> Mapping[str, CameraSettings]:
-    """Return the readout time, direction and stamp offset of each camera."""
-    own = CameraSettings(config.readout_time, config.scan_direction, config.stamp_offset)
-    return config.of_cameras or {"": own}
-
-
-def is_timed(config: NodeConfig, cameras: Mapping[str, Camera]) -> bool:
-    """Return True if frames tell velocities; without a readout time they predict nothing."""
-    rolling = find_solver(config.solver).rolling_shutter
-    return rolling and all(camera.readout_time > 0.0 for camera in cameras.values())

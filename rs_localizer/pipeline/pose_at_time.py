@@ -38,6 +38,15 @@ from rs_localizer.core.shutter import Numbers, numbers_of
 from rs_localizer.core.state import MOTION_PARAMETERS
 from rs_localizer.core.types import Estimate, beyond_rows
 from rs_localizer.io.outputs import BodyPose, Twist
+from rs_localizer.solvers.table import SOLVERS
+
+
+class PublishedMoment(NamedTuple):
+    """The moment of a published pose."""
+
+    stamp_ns: int
+    tau: float  # row time
+    motion: Estimate | None = None  # there, if readings tell it; None: that of the frame
 
 
 def pose_at(estimate: Estimate, tau: float) -> BodyPose:
@@ -87,18 +96,37 @@ def with_timing(
     )
 
 
+def published_motion(
+    estimate: Estimate, moment: PublishedMoment, config: NodeConfig, camera: Camera,
+    deviation: float, is_global: bool,
+) -> tuple[BodyPose, Twist | None]:  # fmt: skip
+    """Return pose and twist of the camera at a moment; no twist where frames tell none.
+
+    Args:
+        estimate: of the frame.
+        moment: for which they are valid.
+        config: settings.
+        camera: the first one.
+        deviation: s, of the readout time.
+        is_global: the shutter is known to be global: an image says nothing of velocities.
+    """
+    readout_time, (_, tau, there) = estimate.span, moment
+    moving = readout_time > 0.0 and SOLVERS[config.solver].rolling_shutter
+    moving = moving and (estimate.aided or not is_global)
+    motion, at = (estimate, tau) if there is None else (there, 0.0)
+    pose = pose_at(motion, at)
+    twist = twist_at(motion, at, readout_time) if moving else None
+    if twist is not None and deviation > 0.0:
+        # The middle row comes later where the readout takes longer; the first one does not.
+        delay = deviation * camera.first_row_time * (tau == 0.0)
+        return with_timing(pose, twist, deviation / readout_time, delay, config.acceleration)
+    return pose, twist
+
+
 def middle_row_ns(config: NodeConfig, camera: Camera, stamp_ns: int) -> int:
     """Return the time at which the middle row of the image with this stamp was exposed."""
     delay = config.stamp_offset - config.readout_time * camera.first_row_time
     return stamp_ns + round(delay * 1e9)
-
-
-class PublishedMoment(NamedTuple):
-    """The moment of a published pose."""
-
-    stamp_ns: int
-    tau: float  # row time
-    motion: Estimate | None = None  # there, if readings tell it; None: that of the frame
 
 
 def published_moment(config: NodeConfig, camera: Camera, stamp_ns: int) -> PublishedMoment:

@@ -36,7 +36,7 @@ from rs_localizer.io.topics import CORRESPONDENCES
 from rs_localizer.io.transforms import Transform, TransformError, Transforms
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline import what_fits
-from rs_localizer.pipeline.frames import FrameLocalizer, is_timed
+from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import INPUTS
 from rs_localizer.pipeline.pose_at_time import PublishedMoment
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unheard
@@ -214,7 +214,7 @@ class RigFrames(FrameLocalizer):
         super().__init__(config, notice, transforms)
 
     def _new_tracker(self, config: NodeConfig, cameras: Mapping[str, Camera]) -> Tracker:
-        tracks = config.tracking and is_timed(config, cameras)
+        tracks = config.tracking and config.is_timed
         localizer = Localizer(self._mounted_cameras(cameras), config)
         return Tracker(localizer, None, tracks, max_prediction=config.max_prediction)
 

@@ -40,7 +40,7 @@ def cloud(
 )
 def test_coarse_coordinates_and_pixels_of_another_resolution_are_told(odd, told, figures):
     camera = odd.pop("of", CAMERA)
-    found = oddities(cloud(**odd), camera, "camera")
+    found = oddities(cloud(**odd), camera, "camera", 20_000)
     assert list(found) == ([] if told is None else [told])
     assert all(figure in found[told] for figure in figures)
 

@@ -294,7 +294,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         if self.config.of_cameras:
             return
         kind = "filter's pose" if given.lasts else "given pose"
-        self._update(kind, FrameLocalizer.give_pose, given)
+        self._update(kind, CameraFrames.give_pose, given)
 
     def _update(self, kind: str, use: Any, *values: Any) -> None:
         """Queue a change of the localizer for the worker, before the next frame."""
