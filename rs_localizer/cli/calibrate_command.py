@@ -38,14 +38,12 @@ if WORKING:
     from rs_localizer.io.imu import ImuRecording
     from rs_localizer.io.maps.files import read_map_file
     from rs_localizer.io.rigs import RigParts
-    from rs_localizer.localizer import Localizer
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.markers.maps import MarkerMap
     from rs_localizer.offline.fleet import Figures
     from rs_localizer.offline.recordings import optical_frame, read_imu_recording
     from rs_localizer.offline.replay import has_frames
     from rs_localizer.pipeline.marker_detector import FrameDetector
-    from rs_localizer.pipeline.what_fits import ids_of, mistake_of
     from rs_localizer.settings import write_camera_file
     from rs_localizer.tools import verdict
     from rs_localizer.tools.adjust.intrinsics import LensErrors
@@ -237,8 +235,6 @@ def _detected(args: Options) -> _Input:
     _warn(detector.mistake)
     find_lens = args.intrinsics or camera is None
     camera = camera or first_lens(size, in_order(images))
-    if not detector.mistake:
-        _warn(mistake_of(Localizer(camera), frames))
     return _Input(images, camera, find_lens, map=marker_map)
 
 

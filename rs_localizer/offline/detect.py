@@ -25,13 +25,11 @@ from rs_localizer.io.recording import (
     IMAGE_TOPIC,
     KEYPOINTS_TOPIC,
 )
-from rs_localizer.localizer import Localizer
 from rs_localizer.markers.prints import Chessboard
 from rs_localizer.offline.image_sources import Carried, Shot
 from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
 from rs_localizer.pipeline.marker_detector import Detected, FrameDetector, correspondences
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.pipeline.what_fits import Mistakes, of_refused
 
 # Fewer corners than this say nothing about how well a pose fits.
 _LEAST_CORNERS = 6
@@ -39,8 +37,6 @@ _LEAST_CORNERS = 6
 _FEW = 0.3
 # After this many images without the map, a few seconds of a video, chance is excluded.
 _PATIENCE = 64
-# Corners of two markers: the least that is left of three.
-_LEAST_INLIERS = 8
 # A global-shutter pose leaves at most so much (px rms) in the stillest images, in percent of all,
 # unless calibration or map are wrong: a good one leaves 0.1 to 0.5.
 _MOST_STILL, _STILL_PERCENT = 1.5, 10.0
@@ -183,8 +179,6 @@ class _MarkerTally:
     def __init__(self, detector: FrameDetector, found: Extraction) -> None:
         marker_map = detector.map
         self._detector, self._map, self._found = detector, marker_map, found
-        self._mistakes, self._mistake = Mistakes(), ""
-        self._last: tuple[Camera, Localizer] | None = None
         self._others: Counter[str] = Counter()
         self._faults: Counter[str] = Counter()
         self._residuals: list[float] = []
@@ -196,17 +190,6 @@ class _MarkerTally:
         if len(detections.ids):
             self._found.counts.append(len(detections.ids))
             self._residuals.append(static_residual(camera, detected))
-            few = len(detections.ids) < _LEAST_CORNERS
-            if not (few or self._residuals[-1] <= _MOST_STILL):  # NaN: a pose behind the camera
-                frame = detections.points, detections.pixels, detections.ids
-                localizer = self._localizer(camera)
-                self._mistake = self._mistakes.explain_frame(lambda: of_refused(localizer, *frame))
-
-    def _localizer(self, camera: Camera) -> Localizer:
-        """Return the localizer of a camera; of the same one as the last time, the same."""
-        if self._last is None or self._last[0] is not camera:
-            self._last = camera, Localizer(camera, min_inliers=_LEAST_INLIERS)
-        return self._last[1]
 
     @property
     def are_few(self) -> bool:
@@ -234,7 +217,7 @@ class _MarkerTally:
     def recorded(self) -> Extraction:
         known = [value for value in self._residuals if np.isfinite(value)]
         faults = list[str]()
-        if mistake := self._mistake or self._detector.mistake:
+        if mistake := self._detector.mistake:
             faults.append(mistake)
         elif known and (least := float(np.percentile(known, _STILL_PERCENT))) > _MOST_STILL:
             faults.append(

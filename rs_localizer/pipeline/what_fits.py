@@ -34,8 +34,6 @@ _RARER = 4
 _AGREED = 2
 # Points are flat if they lie within this share of their extent.
 _FLAT = 0.02
-# Frames of a recording.
-_TRIED = 5
 
 
 class _Frame(NamedTuple):
@@ -74,29 +72,28 @@ _ORDERS = [
     if (first, step) != (0, 1)
 ]
 _CORNERS = ("upper left", "upper right", "lower right", "lower left")
-_Undo = Callable[[_Frame], Array | None]
-# Corrections by name, and the functions that apply them. Of a plane these do not show: mirrored, it
-# is seen from behind.
-_OF_IMAGES: dict[str, _Undo] = {
-    "pixels are mirrored left to right: the sender mirrors them (or the map is left-handed)":
-        _left_right,
-    "pixels are mirrored top to bottom: the sender flips them (or the map is left-handed)":
-        _upside_down,
-    "u and v are exchanged: u counts columns, v rows": _exchanged,
-}  # fmt: skip
-_OF_CORNERS: dict[str, _Undo] = {
-    "corners of markers come in another order: where "
-    f"{', '.join(_CORNERS)} belong, {', '.join(_CORNERS[order.index(k)] for k in range(4))} stand":
-        partial(_reordered, order)
-    for order in _ORDERS
-}  # fmt: skip
-# The two differ by a half turn of the camera and the direction of the shutter, which one image
-# hardly shows: a reversed motion looks alike.
-_MIRRORED = tuple(_OF_IMAGES)[:2]
-_EITHER = (
+_MIRRORED = (
     "pixels are mirrored, left to right or top to bottom: the sender mirrors them (or the map is "
     "left-handed)"
 )
+# Sentences and functions that undo what they say. The two mirrors differ by a half turn of the
+# camera and the direction of the shutter, which one image hardly shows. Of a plane none of these
+# shows: mirrored, it is seen from behind.
+_OF_IMAGES = [
+    (_MIRRORED, _left_right),
+    (_MIRRORED, _upside_down),
+    ("u and v are exchanged: u counts columns, v rows", _exchanged),
+]
+_REORDERED = "corners of markers come in another order: where {} belong, {} stand"
+_OF_CORNERS = [
+    (
+        _REORDERED.format(
+            ", ".join(_CORNERS), ", ".join(_CORNERS[order.index(k)] for k in range(4))
+        ),
+        partial(_reordered, order),
+    )
+    for order in _ORDERS
+]
 
 
 def what_fits(
@@ -110,21 +107,15 @@ def what_fits(
         ids: (n,) of the points, those of a marker's corners four in a row.
     """
     frame = _Frame(pixels, ids, localizer.camera.size)
-    flat = _is_flat(points)
-    fits: dict[str, tuple[int, float]] = {}
-    for mistake, undone in (_OF_CORNERS if flat else _OF_IMAGES | _OF_CORNERS).items():
+    fits: dict[tuple[int, float], str] = {}
+    for mistake, undone in ([] if _is_flat(points) else _OF_IMAGES) + _OF_CORNERS:
         if (changed := undone(frame)) is None:
             continue
         usable = np.isfinite(changed).all(axis=1)
         found = localizer.localize(points[usable], changed[usable])
         if found and (count := int(np.count_nonzero(found.inliers))) >= _MOST * len(points):
-            fits[mistake] = count, -found.residual_rms
-    if not fits:
-        return ""
-    best = max(fits, key=fits.__getitem__)
-    if all(each in fits for each in _MIRRORED) and best in _MIRRORED:
-        best = _EITHER
-    return f"the points fit if {best}"
+            fits[count, -found.residual_rms] = mistake
+    return f"the points fit if {fits[max(fits)]}" if fits else ""
 
 
 def _is_flat(points: Array) -> bool:
@@ -133,15 +124,6 @@ def _is_flat(points: Array) -> bool:
         return True
     extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(extents[2] < _FLAT * extents[0])
-
-
-def of_refused(
-    localizer: Localizer, points: Array, pixels: Array, ids: IntArray | None = None
-) -> str:
-    """Localize a frame, and say what is wrong with it if it is refused; else an empty text."""
-    found = localizer.localize(points, pixels)
-    refused = not found and found.reason in REASONS
-    return what_fits(localizer, points, pixels, ids) if refused else ""
 
 
 def cameras_apart(
@@ -169,22 +151,6 @@ def cameras_apart(
 def ids_of(cloud: Correspondences) -> IntArray | None:
     """Return the ids of a cloud's points, if it has any."""
     return cloud.table["id"].astype(np.int64) if "id" in (cloud.table.dtype.names or ()) else None
-
-
-def mistake_of(localizer: Localizer, frames: Sequence[tuple[Array, Array, IntArray | None]]) -> str:
-    """Say in a sentence what is wrong with a recording, by a few of its frames; else an empty text.
-
-    Args:
-        localizer: of a camera alone.
-        frames: points, pixels and ids of each, as of :func:`what_fits`.
-    """
-    last = ""
-    for k in np.unique(np.linspace(0, len(frames) - 1, _TRIED).astype(int)) if frames else ():
-        found = of_refused(localizer, *frames[k])
-        if found and found == last:
-            return found
-        last = found or last
-    return ""
 
 
 class Mistakes:
