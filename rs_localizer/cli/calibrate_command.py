@@ -7,7 +7,7 @@ from __future__ import annotations
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -118,7 +118,7 @@ def run(options: Options) -> Mapping[str, object]:
             beside = [_beside(out, _TRANSFORMS)]
         elif options.map is not None or options.board is not None:
             beside = [_beside(out, _MAP)]
-        lenses = _lens_writers(options, dict.fromkeys(cameras))
+        lenses = _lens_files(options, cameras).values()
         refuse_existing(options, out, *beside, *lenses)
     sources, found = dict[str, _Input](), dict[str, CameraCalibration]()
     for name, (own, _) in cameras.items():
@@ -156,14 +156,18 @@ def _beside(out: Path, name: str) -> Path:
     return out.with_name(f"{out.stem}_{name}")
 
 
-def _lens_writers(args: Options, cameras: Mapping[str, Camera | None]) -> Writers:
-    """Return what writes the single lenses, if they are wanted; of a rig to ``FILE_NAME``."""
-    file = args.camera_info
+def _lens_files(args: Options, names: Iterable[str]) -> dict[str, Path]:
+    """Return the files of single lenses, if they are wanted; of a rig's camera ``FILE_NAME``."""
+    if (file := args.camera_info) is None:
+        return {}
+    return {name: file.with_stem(f"{file.stem}_{name}") if name else file for name in names}
+
+
+def _lens_writers(args: Options, cameras: Mapping[str, Camera]) -> Writers:
+    """Return what writes the single lenses, if they are wanted."""
     return {
-        file.with_stem(f"{file.stem}_{name}") if name else file: partial(
-            write_calibration, camera=camera
-        )
-        for name, camera in (cameras if file else {}).items()
+        file: partial(write_calibration, camera=cameras[name])
+        for name, file in _lens_files(args, cameras).items()
     }
 
 
@@ -208,31 +212,23 @@ def _correspondences(args: Options, bag: BagReader, config: NodeConfig) -> _Inpu
         raise UsageError("--board is for images; the recording has correspondences")
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
     camera, clouds = recorded(args, bag, config, landmarks)
-    frames = [(cloud.points, cloud.pixels, ids_of(cloud)) for cloud in clouds]
-    _warn(mistake_of(Localizer(camera, config), frames))
     images = [ImagePoints(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in clouds]
     return _Input(images, camera, args.intrinsics)
-
-
-def _warn(*faults: str | None) -> None:
-    for fault in filter(None, faults):
-        print(f"warning: {fault}", file=sys.stderr)
 
 
 def _detected(args: Options) -> _Input:
     marker_map = find_map(args)
     detector = FrameDetector(DetectorConfig(), lambda name, text: None, marker_map)
-    images, frames = list[ImagePoints](), []
+    images = list[ImagePoints]()
     camera: Camera | None = None
     size = (0, 0)
     for image, own in each_image(args, NodeConfig().scan_direction, calibrated=False):
         camera, size = camera or own, image.pixels.shape[::-1]
         found = detector.detect(image).detections
         images.append(ImagePoints(image.stamp_ns, found.points, found.pixels))
-        if len(found.points):
-            frames.append((found.points, found.pixels, found.ids))
-    print(f"{len(frames)} of {len(images)} images show the map")
-    _warn(detector.mistake)
+    print(f"{sum(len(it.points) > 0 for it in images)} of {len(images)} images show the map")
+    if detector.mistake:
+        print(f"warning: {detector.mistake}", file=sys.stderr)
     find_lens = args.intrinsics or camera is None
     camera = camera or first_lens(size, in_order(images))
     return _Input(images, camera, find_lens, map=marker_map)

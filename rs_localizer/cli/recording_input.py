@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import contextlib
 import re
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,7 +33,7 @@ if WORKING:
     from rs_localizer.io.maps.landmarks import Map
     from rs_localizer.io.video import has_times
     from rs_localizer.markers.map_files import read_marker_map
-    from rs_localizer.markers.maps import MarkerMap, other_units
+    from rs_localizer.markers.maps import MarkerMap
     from rs_localizer.markers.poses import Pose
     from rs_localizer.markers.prints import Chessboard
     from rs_localizer.offline.detect import ImageTally, usable
@@ -249,14 +248,6 @@ class TargetOptions:
     )  # fmt: skip
 
 
-def read_checked_map(path: Path) -> MarkerMap:
-    """Read the map of a file, and warn of sizes in other units."""
-    marker_map = read_marker_map(path)
-    for fault in other_units(marker_map):
-        print(f"warning: {path}: {fault}", file=sys.stderr)
-    return marker_map
-
-
 def find_map(args: TargetOptions) -> MarkerMap:
     """Return the given map, or the map of the given board.
 
@@ -268,7 +259,7 @@ def find_map(args: TargetOptions) -> MarkerMap:
     if args.map is not None:
         if args.square is not None:
             raise UsageError("--square goes with --board")
-        return read_checked_map(args.map)
+        return read_marker_map(args.map)
     if args.board is None or args.square is None:
         raise UsageError("--board needs --square")
     columns, rows = read_counts(args.board, "--board")
@@ -280,7 +271,4 @@ def find_map(args: TargetOptions) -> MarkerMap:
     # row, z away from the viewer.
     axes = np.diag([1.0, -1.0, -1.0])
     pose = Pose(-axes @ board.points[0], axes)
-    marker_map = MarkerMap(boards=(replace(board, pose=pose),))
-    for fault in other_units(marker_map):
-        raise UsageError(f"--square: {fault}")
-    return marker_map
+    return MarkerMap(boards=(replace(board, pose=pose),))

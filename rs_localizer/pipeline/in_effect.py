@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What settings mean for the frames that are localized with them."""
+"""The settings that frames are localized with, and those that estimates depend on."""
 
 from dataclasses import fields, replace
 

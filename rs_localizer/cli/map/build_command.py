@@ -25,7 +25,6 @@ from rs_localizer.config import FeatureConfig
 if WORKING:
     from tqdm import tqdm
 
-    from rs_localizer.cli.recording_input import read_checked_map
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.camera_files import lens_parameters
     from rs_localizer.io.maps.files import write_npz
