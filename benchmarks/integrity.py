@@ -31,6 +31,7 @@ from scipy.optimize import minimize
 from tqdm import tqdm
 
 from rs_localizer import integrity
+from rs_localizer.config import Acceleration
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
@@ -184,12 +185,13 @@ def sequence(number: int, kinds: Sequence[str] = KINDS, scene: str = "whole") ->
     world, later = view.world, changed(kind, view.world, rng)
     if matcher == "markers" and kind in ("moved", "stale", "another"):  # whole ones
         later = world + np.tile((later - world).reshape(4, -1, 3).mean(axis=0), (4, 1))
-    tracker, judge = Tracker(Localizer(CAMERA)), Integrity()
+    tracker, judge = Tracker(Localizer(CAMERA)), Integrity(Acceleration())
     person = rng.random() < 0.4 and scene != "board"
     centre, size = rng.uniform([0.0, 0.0], [640.0, 480.0]), rng.uniform(50.0, 170.0)
     drift = rng.normal(0.0, 25.0, 2)
     stamps = [round(1e9 + 1e9 * i / RATE) for i in range(FRAMES)]
     rows: list[Row] = []
+    last_ns = stamps[0]
     jumps = stamps[int(rng.integers(4, 10))] if kind == "jumped" else 0
     for frame in simulate_frames(
         CAMERA, motion, world, view.settings, stamps_ns=stamps, seed=number
@@ -209,7 +211,8 @@ def sequence(number: int, kinds: Sequence[str] = KINDS, scene: str = "whole") ->
         result = tracker.localize(frame.middle_ns, seen, pixels) if len(ids) else None
         if not result:
             continue
-        numbers = judge.numbers(result, seen, prior)
+        seconds, last_ns = 1e-9 * (frame.middle_ns - last_ns), frame.middle_ns
+        numbers = judge.numbers(result, seen, prior, seconds)
         true = frame.motion
         turn = so3.log(np.ascontiguousarray(true.rotation @ result.rotation.T))
         way = true.rotation @ (result.position + true.rotation.T @ true.translation)
@@ -224,7 +227,7 @@ def sequence(number: int, kinds: Sequence[str] = KINDS, scene: str = "whole") ->
 
 def recursive(rows: list[Row]) -> Array:
     """The integrity of each frame."""
-    found, judge, last = [], Integrity(), ("", -1)
+    found, judge, last = [], Integrity(Acceleration()), ("", -1)
     for row in rows:
         if row.sequence != last:
             judge.reset()

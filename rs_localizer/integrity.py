@@ -20,11 +20,13 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rs_localizer.config import Acceleration
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
-from rs_localizer.core.state import TURN
+from rs_localizer.core.state import POSE, TURN
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.prior import Prior
+from rs_localizer.estimation.window import acceleration_covariance
 from rs_localizer.native import entry
 
 NAMES = "apart", "spread", "count", "innovation"
@@ -76,11 +78,14 @@ def _spread(kept: Array, every: Array) -> float:
     return min(max(0.5 * math.log(inner / outer), -3.0), 1.0)
 
 
-def _innovation(estimate: Estimate, prior: Prior) -> float:
-    """Return ``log(1 + d) / 6``, d the squared distance of the pose from its prediction."""
+def _innovation(estimate: Estimate, prior: Prior, added: Array) -> float:
+    """Return ``log(1 + d / 6)``, d the squared distance of the pose from its prediction.
+
+    ``added`` (6,6) is covariance beside the prediction's.
+    """
     if prior.motion is None or prior.covariance is None:
         return 0.0
-    spread = np.asarray(prior.covariance)[:6, :6] + estimate.covariance[:6, :6]
+    spread = np.asarray(prior.covariance)[:6, :6] + estimate.covariance[:6, :6] + added
     if not np.isfinite(spread).all():
         return 0.0
     turn = so3.log(np.ascontiguousarray(prior.motion.rotation @ estimate.rotation.T))
@@ -129,9 +134,15 @@ class SeenLandmarks:
 
 
 class Integrity:
-    """The chance that a track is wrong, frame by frame."""
+    """The chance that a track is wrong, frame by frame.
 
-    def __init__(self) -> None:
+    Args:
+        acceleration: of which cameras are capable. What it explains is no jump of the map, however
+            calmly the camera moved before it was out of sight.
+    """
+
+    def __init__(self, acceleration: Acceleration) -> None:
+        self._acceleration = acceleration
         self._seen = SeenLandmarks()
         self.reset()
 
@@ -145,14 +156,21 @@ class Integrity:
         """Return which landmarks (n,3) were seen too often to be unmatched by chance."""
         return self._seen.stale(_keys(np.asarray(points, float)))
 
-    def numbers(self, estimate: Estimate, points: ArrayLike, prior: Prior | None) -> Array:
+    def numbers(
+        self, estimate: Estimate, points: ArrayLike, prior: Prior | None, seconds: float
+    ) -> Array:
         """Return the numbers (4,) of the next frame, in the order of ``NAMES``.
 
         Args:
             estimate: of the frame.
             points: (n,3) m of its correspondences.
             prior: what the frames before predicted; None: nothing.
+            seconds: since the last of them that had a pose.
         """
+        innovation = 0.0
+        if prior is not None:
+            added = acceleration_covariance(self._acceleration, seconds, estimate.span)
+            innovation = _innovation(estimate, prior, added[POSE, POSE])
         usable = np.isfinite(np.asarray(estimate.residuals))
         every, kept = np.asarray(points, float)[usable], np.asarray(estimate.inliers)[usable]
         self._seen.add(_keys(every), kept)
@@ -163,7 +181,7 @@ class Integrity:
                 _together(every, kept) * outliers,  # less, if few cluster: a person in view
                 _spread(every[kept], every),
                 math.log(max(inliers - 6.0, 1.0)),
-                0.0 if prior is None else _innovation(estimate, prior),
+                innovation,
             ]
         )
 

@@ -164,7 +164,7 @@ class Tracker:
         rig = localizer.rig
         alone = rig.exposure().ahead() if len(rig.cameras) == 1 else None
         self.lens = LensWatch(alone if self.shutter.watches else None, localizer.config)
-        self._integrity = Integrity()
+        self._integrity = Integrity(localizer.config.acceleration)
         self._parts = MovedParts(localizer.config.map_deviation)
         self._last_ns: int | None = None
         self._too_close = 0
@@ -443,7 +443,7 @@ class Tracker:
             if self.lens.matrix is None:
                 self.shutter.add(time_ns, result, *seen, jumped=jumped)
         if result:
-            result = self.lens.widened(self._judged(result, points, prior))
+            result = self.lens.widened(self._judged(time_ns, result, points, prior))
             result = self.shutter.widened(result)
             if self.remembers_motion:
                 result = self._covering(replace(result, time_ns=time_ns), context)
@@ -601,6 +601,7 @@ class Tracker:
 
     def _judged(
         self,
+        time_ns: int,
         result: Estimate,
         points: ArrayLike | Mapping[str, Sequence[ArrayLike]],
         prior: Prior | None,
@@ -608,7 +609,8 @@ class Tracker:
         """Return the estimate with its integrity; a rig, and no covariance, give none."""
         if isinstance(points, Mapping) or np.isnan(result.joint_covariance[0, 0]):
             return result
-        numbers = self._integrity.numbers(result, points, prior)
+        seconds = 0.0 if self._track is None else 1e-9 * (time_ns - self._track.time_ns)
+        numbers = self._integrity.numbers(result, points, prior, seconds)
         return replace(result, integrity=self._integrity.add(numbers))
 
     def _prior(

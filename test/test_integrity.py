@@ -10,6 +10,7 @@ import pytest
 
 import rs_localizer as rsl
 from benchmarks.integrity import SCENES, recursive, sequence
+from rs_localizer.config import Acceleration
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.prior import Prior
@@ -17,6 +18,7 @@ from rs_localizer.integrity import Integrity, SeenLandmarks
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 RNG = np.random.default_rng(0)
+FRAME = 1.0 / 30.0  # s
 POINTS = RNG.uniform([-3.0, -3.0, 3.0], [3.0, 3.0, 9.0], (120, 3))
 
 
@@ -30,8 +32,10 @@ def estimate(kept: Any, tracked: bool = True) -> Estimate:
 
 
 def run(frames: int, kept: Any, prior: Prior | None = None) -> list[float]:
-    judge = Integrity()
-    return [judge.add(judge.numbers(estimate(kept(), i > 0), POINTS, prior)) for i in range(frames)]
+    judge, doubts = Integrity(Acceleration()), []
+    for i in range(frames):
+        doubts.append(judge.add(judge.numbers(estimate(kept(), i > 0), POINTS, prior, FRAME)))
+    return doubts
 
 
 def anywhere() -> Any:
@@ -53,36 +57,49 @@ def test_chance_outliers_are_no_doubt_and_a_part_that_fits_alone_is():
 
 
 def test_doubt_falls_again():
-    judge = Integrity()
+    judge = Integrity(Acceleration())
     doubts = [
-        judge.add(judge.numbers(estimate(kept), POINTS, None))
+        judge.add(judge.numbers(estimate(kept), POINTS, None, FRAME))
         for kept in (*(near() for _ in range(10)), *(anywhere() for _ in range(15)))
     ]
     assert doubts[9] > 0.2
     assert doubts[-1] < 0.05
     judge.reset()
-    assert judge.add(judge.numbers(estimate(anywhere()), POINTS, None)) < 0.1
+    assert judge.add(judge.numbers(estimate(anywhere()), POINTS, None, FRAME)) < 0.1
+
+
+def jumping(unseen: float) -> list[float]:
+    """Doubts of a track that jumps by half a metre twice, after so many seconds out of sight."""
+    judge, doubts = Integrity(Acceleration()), []
+    for i in range(40):
+        jumps = i in (10, 30)
+        aside = np.array([0.5 if jumps else 0.005, 0.0, 0.0])  # m, known to a centimetre
+        motion = Motion(np.eye(3), aside, np.zeros(3), np.zeros(3))
+        prior = Prior(motion=motion, covariance=1e-4 * np.eye(12))
+        seen = estimate(anywhere(), i > 0), POINTS, prior, unseen if jumps else FRAME
+        doubts.append(judge.add(judge.numbers(*seen)))
+    return doubts
 
 
 def test_a_pose_that_jumps_is_doubted_until_it_jumps_back():
-    judge, doubts = Integrity(), []
-    for i in range(40):
-        aside = np.array([0.5 if i in (10, 30) else 0.005, 0.0, 0.0])  # m, known to a centimetre
-        motion = Motion(np.eye(3), aside, np.zeros(3), np.zeros(3))
-        prior = Prior(motion=motion, covariance=1e-4 * np.eye(12))
-        doubts.append(judge.add(judge.numbers(estimate(anywhere(), i > 0), POINTS, prior)))
+    doubts = jumping(FRAME)
     assert max(doubts[:10]) < 0.05
     assert min(doubts[10:30]) > 0.5  # a map that is wrong everywhere alike shows nothing else
     assert max(doubts[31:]) < 0.5
     assert doubts[31] < doubts[29]
 
 
+def test_a_hand_that_was_out_of_sight_has_not_jumped():
+    """In 0.7 s it moves by half a metre at 2 m/s^2, of the 4 that settings allow."""
+    assert max(jumping(0.7)) < 0.05
+
+
 def test_landmarks_that_are_never_matched_are_named_and_no_others():
     """Half of the matches are wrong by chance; five landmarks are gone."""
-    judge, gone = Integrity(), np.arange(120) < 5
+    judge, gone = Integrity(Acceleration()), np.arange(120) < 5
     for i in range(60):
         kept = (RNG.random(120) < 0.5) & ~gone
-        judge.numbers(estimate(kept, i > 0), POINTS, None)
+        judge.numbers(estimate(kept, i > 0), POINTS, None, FRAME)
         if i == 5:
             assert not judge.stale(POINTS).any()  # six misses of half say nothing
     assert np.array_equal(judge.stale(POINTS), gone)

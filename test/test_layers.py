@@ -33,7 +33,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "estimation": {"core", "config", "native", "solvers"},
     "inertial": {"core", "estimation", "native"},
     "localizer": {"core", "config", "solvers", "estimation"},
-    "integrity": {"core", "estimation", "native"},
+    "integrity": {"core", "config", "estimation", "native"},
     "repeated_images": {"core", "estimation"},
     "lens_watch": {"core", "config", "estimation"},
     "shutter_watch": {"core", "estimation"},
