@@ -81,7 +81,7 @@ def test_projecting_undoes_rays_also_with_binning_and_roi(model, D):
 
 @pytest.mark.parametrize(("model", "D"), LENSES)
 @pytest.mark.parametrize("part", [{}, PART])
-def test_kernels_of_many_pixels_give_the_same(model, D, part):
+def test_kernels_of_many_pixels_and_differences_give_the_same(model, D, part):
     """203: some blocks of lanes, and a part of one."""
     lens = camera(D=D, distortion_model=model, **part)
     raw = pixels(203) / lens.binning
@@ -90,6 +90,11 @@ def test_kernels_of_many_pixels_give_the_same(model, D, part):
     rays = lens.rays(raw)
     for ours, theirs in zip(projected(lens, rays), lens.distort(rays), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-9)
+    ahead, behind = (
+        np.stack([lens.distort(rays + step)[0] for step in side * np.eye(2)], axis=2)
+        for side in (1e-5, -1e-5)
+    )
+    np.testing.assert_allclose(lens.pixel_jacobian(rays), (ahead - behind) / 2e-5, atol=1e-3)
     points = np.column_stack([2.0 * rays, np.full(len(rays), 2.0)])
     points[7] *= -1.0
     np.testing.assert_allclose(seen_at(lens, points), lens.project(points), rtol=1e-10, atol=1e-9)

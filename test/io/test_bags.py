@@ -12,14 +12,7 @@ import pytest
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_typestore
 
-from rs_localizer.io.bags import (
-    STORAGES,
-    BagError,
-    BagWriter,
-    is_bag,
-    make_message,
-    open_bag,
-)
+from rs_localizer.io.bags import STORAGES, BagError, BagWriter, is_bag, make_message, open_bag
 from rs_localizer.io.messages import make_header
 
 

@@ -12,12 +12,7 @@ import pytest
 from rs_localizer.io.outputs import CameraShare
 from rs_localizer.pipeline.map_to_odom import CorrectionState, Decision, Standing
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.ros.localizer.health import (
-    Condition,
-    diagnose,
-    integrity_message,
-    tell,
-)
+from rs_localizer.ros.localizer.health import Condition, diagnose, integrity_message, tell
 from rs_localizer.ros.node.diagnostics import Level
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import Statistics

@@ -33,7 +33,7 @@ def test_an_end_that_the_middleware_holds_up_is_cut_short(start_node):
     """Launch files kill what has not ended after five seconds."""
     node = start_node(
         run="import rclpy, sys, time; rclpy.try_shutdown = lambda: time.sleep(9999);"
-        "from rs_localizer.ros.main import main; sys.exit(main())",
+        "from rs_localizer.ros.main import main; sys.exit(main())"
     )
     node.wait_for_log("active with solver")
     assert node.stop(signal.SIGTERM) == 0
