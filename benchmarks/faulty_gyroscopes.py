@@ -53,7 +53,7 @@ _NOISE = 1.0  # px
 _BEGIN = 5  # frames
 _INSIDE = 12.592  # 95 % quantile of chi-squared with six degrees of freedom
 _LENGTH = 60  # frames of a recording
-_BEFORE_NS, _AFTER_NS = 600_000_000, 10_000_000
+_BEFORE_NS = 600_000_000
 _LATEST_NS = 60_000_000  # stamps that are early or late by no more than this
 
 
@@ -71,16 +71,13 @@ class Found:
 def followed(recorded: Recorded, with_imu: bool = True) -> Found:
     """Track the frames of each recording with the gyroscope's readings, or the camera alone."""
     frames, rows, used, said = recorded.frames, [], 0, ""
-    tracker, buffer = Tracker(Localizer(believed(frames.camera))), SampleBuffer()
     half_ns = round(0.5e9 * frames.camera.readout_time)
     for frame in range(len(frames)):
-        middle_ns, which = frames.middle_ns(frame), int(frames.recording[frame])
+        middle_ns = frames.middle_ns(frame)
         if frames.place[frame] == 0:
-            tracker = Tracker(
-                Localizer(believed(frames.camera)), recorded.aid() if with_imu else None
-            )
-            buffer, every = SampleBuffer(), recorded.samples[which]
-            heard = 0
+            aid = recorded.aid() if with_imu else None
+            tracker, buffer = Tracker(Localizer(believed(frames.camera)), aid), SampleBuffer()
+            every, heard = recorded.samples[int(frames.recording[frame])], 0
         samples = None
         if with_imu:
             until = int(np.searchsorted(every.times_ns, middle_ns + _LATEST_NS))
@@ -88,10 +85,9 @@ def followed(recorded: Recorded, with_imu: bool = True) -> Found:
                 x, y, z = every.angular_velocity[k].tolist()
                 buffer.add(int(every.times_ns[k]), "camera", (x, y, z))
             heard = until
-            found = buffer.between(
-                middle_ns - half_ns, middle_ns + half_ns,
-                middle_ns - _BEFORE_NS, middle_ns + _LATEST_NS,
-            )  # fmt: skip
+            first_ns, last_ns = middle_ns - half_ns, middle_ns + half_ns
+            since_ns, until_ns = middle_ns - _BEFORE_NS, middle_ns + _LATEST_NS
+            found = buffer.between(first_ns, last_ns, since_ns, until_ns)
             if isinstance(found, Unused):
                 said = found.reason.removeprefix("imu_")
             else:
@@ -123,35 +119,25 @@ def _errors(recorded: Recorded, frame: int, found: Estimate | None) -> tuple[flo
 
 def table(faults: Sequence[str], recordings: int, seed: int) -> Table:
     """One row a fault: both scenes, beside the camera alone."""
-    columns = [column for name in SCENES for column in (name, "inside")]
-    rows: list[list[str]] = []
-    alone = {
-        name: followed(record(Camera(), hand, scene, (recordings, _LENGTH), seed), False)
-        for name, scene in SCENES.items()
-    }
-    row: list[str] = []
-    for one in alone.values():
-        row += [
-            f"{np.nanmedian(one.orientation):.3f}, {np.nanmedian(one.rate):.1f}",
-            f"{100.0 * np.nanmean(one.inside):.0f}",
-        ]
-    rows.append(["alone (deg, deg/s)", *row, "", ""])
-    for fault in faults:
-        row, used, said = [], [], ""
+    alone: dict[str, Found] = {}
+    rows = []
+    for fault in ("", *faults):
+        row, used, said = [fault or "alone (deg, deg/s)"], [], ""
         for name, scene in SCENES.items():
-            imu = FAULTS[fault]
-            one = followed(record(Camera(), hand, scene, (recordings, _LENGTH), seed, imu))
-            both = [
-                np.nanmedian(aided) / np.nanmedian(own)
-                for aided, own in (
-                    (one.orientation, alone[name].orientation), (one.rate, alone[name].rate)
-                )
-            ]  # fmt: skip
-            row += [f"{both[0]:.2f}, {both[1]:.2f}", f"{100.0 * np.nanmean(one.inside):.0f}"]
-            used.append(f"{100.0 * one.used:.0f}")
+            size, imu = (recordings, _LENGTH), FAULTS.get(fault)
+            one = followed(record(Camera(), hand, scene, size, seed, imu), bool(fault))
+            own = alone.setdefault(name, one)
+            off, rate = np.nanmedian(one.orientation), np.nanmedian(one.rate)
+            figures = f"{off:.3f}, {rate:.1f}"
+            if fault:
+                off, rate = off / np.nanmedian(own.orientation), rate / np.nanmedian(own.rate)
+                figures = f"{off:.2f}, {rate:.2f}"
+                used.append(f"{100.0 * one.used:.0f}")
+            row += [figures, f"{100.0 * np.nanmean(one.inside):.0f}"]
             said = one.said or said
-        rows.append([fault, *row, ", ".join(used), said])
-    return Table(("", *columns, "used", "says"), rows)
+        rows.append([*row, ", ".join(used), said])
+    heads = [head for name in SCENES for head in (name, "inside")]
+    return Table(("", *heads, "used", "says"), rows)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -112,20 +112,15 @@ def _wall(rng: np.random.Generator) -> Array:
     return _tilted(np.column_stack([flat, np.zeros(len(flat))]), 2.0, rng)
 
 
-def _flat_board() -> Array:
-    """A chessboard of 9 x 6 corners, half a metre wide."""
+def _board(rng: np.random.Generator, *degrees: float) -> Array:
+    """A chessboard of 9 x 6 corners, half a metre wide, 1 m away."""
     x, y = np.meshgrid(np.linspace(-0.25, 0.25, 9), np.linspace(-0.156, 0.156, 6))
-    return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-
-
-def _board(rng: np.random.Generator) -> Array:
-    """The board, 1 m away."""
-    return _tilted(_flat_board(), 1.0, rng)
+    return _tilted(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]), 1.0, rng, *degrees)
 
 
 def _facing(rng: np.random.Generator) -> Array:
     """The board, nearly parallel to the image."""
-    return _tilted(_flat_board(), 1.0, rng, (0.0, 5.0))
+    return _board(rng, 0.0, 5.0)
 
 
 def _hall(rng: np.random.Generator) -> Array:
@@ -142,12 +137,12 @@ def _room(rng: np.random.Generator) -> Array:
 
 
 def _tilted(
-    flat: Array, distance: float, rng: np.random.Generator,
-    degrees: tuple[float, float] = (10.0, 35.0),
-) -> Array:  # fmt: skip
+    flat: Array, distance: float, rng: np.random.Generator, least: float = 10.0, most: float = 35.0
+) -> Array:
+    """By so many degrees about an axis in the image."""
     around = rng.uniform(0.0, 2.0 * np.pi)
     axis = np.array([np.cos(around), np.sin(around), 0.0])
-    turned: Array = flat @ exponential(np.radians(rng.uniform(*degrees)) * axis).T
+    turned: Array = flat @ exponential(np.radians(rng.uniform(least, most)) * axis).T
     turned[:, 2] += distance
     return turned
 
@@ -290,7 +285,7 @@ class _Tally:
     """What became of the frames of a row."""
 
     def __init__(self) -> None:
-        self.frames = self.published = self.twists = 0
+        self.published = self.twists = 0
         self.inside, self.beyond = np.zeros(2, int), 0
         self.errors: list[tuple[float, float, float]] = []
         self.said: Counter[str] = Counter()
@@ -329,14 +324,8 @@ class _Tally:
             for hits, count in zip(self.inside, (self.published, self.twists), strict=True)
         ]
         said = [name for name, _ in self.said.most_common() if name not in _NO_WORD]
-        return (
-            name,
-            f"{self.published}",
-            *cells,
-            " ".join(inside),
-            f"{self.beyond}",
-            ", ".join(said[:2]) or "nothing",
-        )
+        heard = ", ".join(said[:2]) or "nothing"
+        return name, f"{self.published}", *cells, " ".join(inside), f"{self.beyond}", heard
 
 
 def _squared(off: Array, covariance: Array) -> float:
@@ -347,19 +336,15 @@ def judged(kind: Kind, seed: int, count: int = _RECORDINGS, length: int = _LENGT
     """The frames of a kind, localized: so many recordings of so many frames."""
     rng = np.random.default_rng([seed, *kind.name.encode()])
     motions, camera = kind.motion(count, rng), kind.camera
-    tally = _Tally()
-    which = np.repeat(np.arange(count), length)
-    times = np.tile(1e-9 * PERIOD_NS * (np.arange(length) - length // 2), count)
-    scene = kind.scene(rng)
-    # Every recording has its own map: the scene stands before its first pose.
-    frames = [_frames(kind, motions, k, scene, times[which == k]) for k in range(count)]
-    for k, (exact, bearings, points) in enumerate(frames):
-        here = times[which == k]
-        true = motions.states(np.full(len(here), k), here)
-        middle = motions.poses(np.full(len(here), k), here + 0.5 * camera.readout_time)[0]
+    tally, scene = _Tally(), kind.scene(rng)
+    times = 1e-9 * PERIOD_NS * (np.arange(length) - length // 2)
+    for k in range(count):
+        here = np.full(length, k)
+        # Every recording has its own map: the scene stands before its first pose.
+        exact, bearings, points = _frames(kind, motions, k, scene, times)
+        middle = motions.poses(here, times + 0.5 * camera.readout_time)[0]
         seen = Seen(camera.matrix, camera.distortion, points, exact, bearings, middle)
-        told = kind.fault(seen, rng) if kind.fault is not right else seen
-        _localize(kind, told, true, rng, tally)
+        _localize(kind, kind.fault(seen, rng), motions.states(here, times), rng, tally)
     return tally
 
 
@@ -398,10 +383,8 @@ def _localize(
             table[name] = column
         table["id"] = np.flatnonzero(shown[frame])
         stamp = _START_NS + frame * PERIOD_NS
-        found = localizer.localize_cloud(
-            Correspondences(stamp, "map", points, noisy, None, 0, table)
-        )
-        tally.frames += 1
+        cloud = Correspondences(stamp, "map", points, noisy, None, 0, table)
+        found = localizer.localize_cloud(cloud)
         if found:
             tally.add(found, true, frame)
         elif found is not None:
