@@ -21,6 +21,7 @@ from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.recording import write_frame
 
 TRUE = TrueCamera()
+CAMERA = Camera(TRUE.width, TRUE.height, K=TRUE.matrix, D=np.array(TRUE.distortion))
 LENGTH = 8
 # The lens is exact.
 CONFIG = NodeConfig(
@@ -36,19 +37,12 @@ def frames() -> Frames:
 @pytest.fixture(scope="module")
 def recording(frames, tmp_path_factory):
     path = tmp_path_factory.mktemp("gyro") / "rec"
-    camera = Camera(TRUE.width, TRUE.height, K=TRUE.matrix, D=np.array(TRUE.distortion))
     with BagWriter(path) as bag:
         for k in range(LENGTH):
             points, pixels = frames.seen(k, 0.1)
-            write_frame(
-                bag, camera, int(frames.stamp_ns[k]), points, pixels, np.arange(len(points))
-            )
+            ids = np.arange(len(points))
+            write_frame(bag, CAMERA, int(frames.stamp_ns[k]), points, pixels, ids)
     return path
-
-
-@pytest.fixture(scope="module")
-def gyroscope(frames) -> Gyroscope:
-    return exact(frames)
 
 
 def exact(frames) -> Gyroscope:
@@ -67,8 +61,8 @@ def test_mean_rates_are_those_of_the_turn_between_two_times():
     np.testing.assert_allclose(mean, [[0.4, 2.0, -0.4]], atol=1e-12)
 
 
-def test_right_twists_are_near_and_turned_round_ones_far(recording, gyroscope, tmp_path, capsys):
-    read = read_bag(recording, CONFIG)
+def test_right_twists_are_near_and_turned_round_ones_far(recording, frames, tmp_path, capsys):
+    read, gyroscope = read_bag(recording, CONFIG), exact(frames)
     rows = judge(read, gyroscope, CONFIG).rows
     for name in ("single", "tracked"):
         assert rows[name].localized == LENGTH
@@ -89,30 +83,26 @@ def test_right_twists_are_near_and_turned_round_ones_far(recording, gyroscope, t
 
 
 def test_clock_axes_and_bias_of_a_gyroscope_are_found():
-    frames, camera = (
-        simulate(TRUE, motions.hand, Rich(80), 1, 60, seed=3),
-        Camera(TRUE.width, TRUE.height, K=TRUE.matrix, D=np.array(TRUE.distortion)),
-    )
+    frames = simulate(TRUE, motions.hand, Rich(80), 1, 60, seed=3)
     middle = round(0.5e9 * TRUE.readout_time)
     images = [Frame(int(frames.stamp_ns[k]) + middle, *frames.seen(k, 0.1)) for k in range(60)]
     truth, mount = exact(frames), Rotation.from_rotvec([0.3, -1.2, 2.0])
     moved = Gyroscope(truth.times - 0.037, mount.apply(truth.rates) + np.array([0.01, -0.02, 0.03]))
-    found, said = aligned(moved, Recording("mini", camera, images))
+    found, said = aligned(moved, Recording("mini", CAMERA, images))
     assert "+3" in said
     np.testing.assert_allclose(found.times, truth.times, atol=1e-3)
     assert np.degrees(np.median(np.linalg.norm(found.rates - truth.rates, axis=1))) < 0.5
     with pytest.raises(ValueError, match="7 pairs of neighbours are localized, 20 are needed"):
-        aligned(moved, Recording("short", camera, images[:8]))
+        aligned(moved, Recording("short", CAMERA, images[:8]))
 
 
 @pytest.mark.parametrize("name", PEERS)
 def test_peers_find_a_still_camera(name):
     rng = np.random.default_rng(0)
-    camera = Camera(640, 480, K=TRUE.matrix, D=np.array(TRUE.distortion))
     points = rng.uniform([-1.0, -1.0, 3.0], [1.0, 1.0, 5.0], (60, 3))
-    pixels = camera.project(points)
-    pose = PEERS[name](camera, points, pixels)
+    pixels = CAMERA.project(points)
+    pose = PEERS[name](CAMERA, points, pixels)
     np.testing.assert_allclose(pose.rotation, np.eye(3), atol=1e-4)
     np.testing.assert_allclose(pose.position, 0.0, atol=1e-3)
     assert pose.residuals.max() < 0.1
-    assert solve_pnp(camera, points[:3], pixels[:3]) is None
+    assert solve_pnp(CAMERA, points[:3], pixels[:3]) is None
