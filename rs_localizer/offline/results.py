@@ -298,7 +298,7 @@ def summary(tally: Tally, config: NodeConfig, out: Path, timed: bool = True) -> 
         if rolling:
             rows.append(("tracked from the frame before", f"{tally.column('tracked').mean():.1%}"))
     if tally.aid is not None:
-        rows += tally.aid.rows()
+        rows += tally.aid.values().items()
     if timed:
         rows.append(("frames per second", f"{tally.total / tally.seconds:.0f}"))
     if (smoothed := tally.smoothed) is not None:

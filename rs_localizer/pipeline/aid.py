@@ -39,6 +39,8 @@ _BUNDLE = 0.05
 # Frames over which the share is told, and in a row before the log is told: at the beginning some
 # are without, and now and then a message is lost.
 _MANY, _LONG = 100, 5
+# Share of the last frames below which it is worth a warning that the IMU is not used.
+FEW = 0.5
 # Frames whose accelerometer readings average a hand's accelerations out of gravity.
 _SOME = 30
 
@@ -56,11 +58,9 @@ def in_words(unused: Unused) -> str:
 class AidState:
     """State of the IMU, for people."""
 
-    frames: int  # since its first reading
-    used: int  # of them
-    share: float  # of the last of them
+    share: float  # of the last frames
     mostly: Unused | None  # most frequent of the last frames; None: it was used in all
-    reasons: dict[ImuReason, int]  # of the others, how many for which
+    reasons: dict[ImuReason, int]  # frames that went without, by reason
     rate: float  # Hz; NaN: unknown
     time_offset: float  # s to be added to its stamps, in all; NaN: unknown
     status: InertialStatus | None  # what the frames say of the gyroscope
@@ -68,22 +68,29 @@ class AidState:
     # None: imu.gravity is off
     gravity: float | None = None
 
-    def rows(self) -> list[tuple[str, object]]:
-        """Return names and values of a summary."""
-        rows: list[tuple[str, object]] = [
-            ("localized with the IMU", f"{self.used / self.frames:.1%}"),
-            *((f"  without: {reason}", count) for reason, count in self.reasons.items()),
-        ]
-        if self.used and self.status is not None and math.isfinite(self.time_offset):
-            bias = np.linalg.norm(np.degrees(self.status.bias))
-            offset, deviation = 1e3 * self.time_offset, 1e3 * self.status.time_offset_deviation
-            rows += [
-                ("  bias of the gyroscope (deg/s)", f"{bias:.2f}"),
-                ("  time offset of the IMU (ms)", f"{offset:.2f} +- {deviation:.2f}"),
-            ]
-            if self.status.oddity:
-                rows.append(("  said by the camera's rotation:", self.status.oddity))
-        return rows
+    def values(self) -> dict[str, str]:
+        """Return values by readable names, without what is not known."""
+        alone = self.mostly if self.share < FEW else None
+        use = "used" if alone is None else f"not used: {in_words(alone)}"
+        values = {"IMU": use, "IMU used (share of the last frames)": f"{self.share:.0%}"}
+        if self.gravity is not None:
+            finite = math.isfinite(self.gravity)
+            values["IMU gravity off gravity_in_map (deg)"] = (
+                f"{math.degrees(self.gravity):.1f}" if finite else "not known yet"
+            )
+        if math.isfinite(self.rate):
+            values["IMU rate (Hz)"] = f"{self.rate:.1f}"
+        status = self.status
+        if status is not None and np.all(np.isfinite(status.bias)):
+            bias = " ".join(f"{value:.3f}" for value in np.degrees(status.bias))
+            deviation = math.degrees(status.bias_deviation)
+            values["IMU bias (deg/s, camera axes)"] = f"{bias} +- {deviation:.3f}"
+        if status is not None and status.oddity:
+            values["IMU contradicted by the camera"] = status.oddity
+        if status is not None and math.isfinite(self.time_offset):
+            offset, deviation = 1e3 * self.time_offset, 1e3 * status.time_offset_deviation
+            values["IMU time offset (ms)"] = f"{offset:.2f} +- {deviation:.2f}"
+        return values | {f"IMU not used: {reason}": str(n) for reason, n in self.reasons.items()}
 
 
 class Moment(NamedTuple):
@@ -120,7 +127,6 @@ class AidInput:
         self._force_in_map = np.zeros(3)  # mean of the last frames
         self._with_force = 0  # how many
         self._gravity: float | None = None
-        self._frames = self._used = 0
         self._reasons: Counter[ImuReason] = Counter()
         self._in_a_row: deque[ImuReason] = deque(maxlen=_LONG)
         self._reported: ImuReason | None = None
@@ -153,8 +159,6 @@ class AidInput:
         reasons = [unused.reason for unused in recently if unused is not None]
         usual = max(reasons, key=reasons.count, default=None)
         return AidState(
-            self._frames,
-            self._used,
             recently.count(None) / len(recently),
             next((u for u in reversed(recently) if u is not None and u.reason == usual), None),
             dict(self._reasons),
@@ -245,8 +249,6 @@ class AidInput:
             return Unused(ImuReason.NO_TRANSFORM, text)
 
     def _count(self, config: NodeConfig, tracker: Tracker | None, unused: Unused | None) -> None:
-        self._frames += 1
-        self._used += unused is None
         self._recently.append(unused)
         aid = None if tracker is None else tracker.aid
         self._status = None if aid is None else aid.status

@@ -144,10 +144,10 @@ def test_replay_uses_it_and_says_so(tmp_path, ran):
     poses = []
     for name, words in (("both", []), ("alone", ["-p", "imu.use:=none"])):
         said = ran(*replay, "--out", tmp_path / name, *words).out
-        assert ("localized with the IMU" in said) == (name == "both")
+        assert ("IMU used (share of" in said) == (name == "both")
         if name == "both":
-            assert re.search(r"localized with the IMU +(9\d\.\d|100\.0)%", said)
-            assert re.search(r"time offset of the IMU \(ms\) +-?\d+\.\d\d", said)
+            assert re.search(r"IMU used \(share of the last frames\) +(9\d|100)%", said)
+            assert re.search(r"IMU time offset \(ms\) +-?\d+\.\d\d", said)
         poses.append((tmp_path / name / "poses.txt").read_bytes())
     assert poses[0] != poses[1]
     more = [*replay, "--out", str(tmp_path / "n"), "-r"]

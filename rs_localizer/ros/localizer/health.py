@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rs_localizer.core.reasons import ImuReason, Notice
 from rs_localizer.io.messages import make_header
 from rs_localizer.io.outputs import Localized
-from rs_localizer.pipeline.aid import AidState, in_words
+from rs_localizer.pipeline.aid import FEW, AidState, in_words
 from rs_localizer.pipeline.camera_frames import DOUBTFUL
 from rs_localizer.pipeline.inputs import Role, input_in_words, input_named
 from rs_localizer.pipeline.map_to_odom import Decision, Standing
@@ -75,8 +75,6 @@ def integrity_message(frame: Localized) -> DiagnosticArray:
     return DiagnosticArray(header=header, status=[status])
 
 
-# Share of the last frames below which it is worth a warning that the IMU is not used.
-_FEW = 0.5
 # Accelerometers and maps are upright to a few degrees; a wrong direction is off by 90 or 180.
 _MOST_TILT = math.radians(10.0)
 
@@ -86,7 +84,7 @@ def imu_oddity(state: AidState | None) -> dict[str, str]:
     if state is None:
         return {}
     oddities = {}
-    if state.mostly is not None and state.share < _FEW:
+    if state.mostly is not None and state.share < FEW:
         mostly, look_at = in_words(state.mostly), state.mostly.reason.look_at
         oddities["imu"] = f"the IMU is not used: {mostly} ({look_at})"
     if state.status is not None and state.status.oddity:
@@ -109,31 +107,6 @@ def readout_values(seen: MeasuredReadout | None) -> dict[str, str]:
         return {}
     readout, deviation = 1e3 * seen.readout_time, 1e3 * seen.deviation
     return {"Readout time seen (ms)": f"{readout:.2f} +- {deviation:.2f}"}
-
-
-def imu_values(state: AidState | None) -> dict[str, str]:
-    """Return values by readable names, without what is not known."""
-    if state is None:
-        return {}
-    alone = state.mostly if state.share < _FEW else None
-    use = "used" if alone is None else f"not used: {in_words(alone)}"
-    values = {"IMU": use, "IMU used (share of the last frames)": f"{state.share:.0%}"}
-    if state.gravity is not None:
-        finite = math.isfinite(state.gravity)
-        values["IMU gravity off gravity_in_map (deg)"] = (
-            f"{math.degrees(state.gravity):.1f}" if finite else "not known yet"
-        )
-    if math.isfinite(state.rate):
-        values["IMU rate (Hz)"] = f"{state.rate:.1f}"
-    status = state.status
-    if status is not None and np.all(np.isfinite(status.bias)):
-        bias = " ".join(f"{value:.3f}" for value in np.degrees(status.bias))
-        deviation = math.degrees(status.bias_deviation)
-        values["IMU bias (deg/s, camera axes)"] = f"{bias} +- {deviation:.3f}"
-    if status is not None and math.isfinite(state.time_offset):
-        offset, deviation = 1e3 * state.time_offset, 1e3 * status.time_offset_deviation
-        values["IMU time offset (ms)"] = f"{offset:.2f} +- {deviation:.2f}"
-    return values | {f"IMU not used: {reason}": str(n) for reason, n in state.reasons.items()}
 
 
 # Frames in a row without a pose after which the camera is lost.

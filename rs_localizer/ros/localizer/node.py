@@ -43,7 +43,6 @@ from rs_localizer.ros.localizer.health import (
     Condition,
     diagnose,
     imu_oddity,
-    imu_values,
     integrity_message,
     of_interest,
     readout_values,
@@ -333,7 +332,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
             watch, imu = frames.shutter, frames.aid.state
             oddities |= imu_oddity(imu)
             oddities |= {"readout_time": watch.fault} if watch.fault else {}
-            values = readout_values(watch.measured) | imu_values(imu)
+            values = readout_values(watch.measured) | (imu.values() if imu else {})
         inputs = {
             name: item for name, item in self.silence.items() if name in inputs_of(self.config)
         }
