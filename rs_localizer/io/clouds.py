@@ -229,6 +229,20 @@ def _packed(row_type: np.dtype[Any]) -> np.dtype[Any]:
     return np.dtype([(n, fields[n][0].newbyteorder("<")) for n in fields] + [("residual", "<f4")])
 
 
+def make_rows(kinds: Sequence[tuple[Any, ...]], columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Return packed rows (k,) of these fields, from a column (k,...) of each."""
+    rows = np.empty(len(columns[0]), list(kinds))
+    for (name, *_), column in zip(kinds, columns, strict=True):
+        rows[name] = column
+    return rows
+
+
+def point_fields(kind: str) -> list[tuple[str, str]]:
+    """Return the fields of a cloud of markers' corners, with coordinates of this type."""
+    pixels = [("u", "<f4"), ("v", "<f4"), ("score", "<f4"), ("id", "<u4")]
+    return [*((name, kind) for name in "xyz"), *pixels]
+
+
 def make_cloud(make: Make, stamp: int, frame: str, rows: NDArray[Any]) -> Any:
     """Make a sensor_msgs/PointCloud2 of packed little-endian rows (k,)."""
     row_type = rows.dtype

@@ -11,7 +11,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, Roi
 from rs_localizer.io import topics
 from rs_localizer.io.bags import BagWriter, make_message
-from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.clouds import make_cloud, make_rows
 from rs_localizer.io.messages import make_header
 
 CAMERA_FRAME = "camera_optical_frame"
@@ -30,7 +30,7 @@ MARKER_MAP = "marker_map.yaml"
 MAP = "map.npz"
 
 # Single precision is what RViz shows and most trackers give: 3e-5 px at the rim of an image.
-_ROW = np.dtype([(name, "<f4") for name in ("x", "y", "z", "u", "v")] + [("id", "<u4")])
+_ROW = [*((name, "<f4") for name in "xyzuv"), ("id", "<u4")]
 
 
 def write_frame(
@@ -51,10 +51,7 @@ def make_correspondences(
     stamp_ns: int, points: Array, pixels: Array, ids: NDArray[np.int64]
 ) -> Any:
     """Make a sensor_msgs/PointCloud2 of points (n,3), raw pixels (n,2) and ids (n,)."""
-    rows = np.empty(len(points), _ROW)
-    for column, name in enumerate("xyz"):
-        rows[name] = points[:, column]
-    rows["u"], rows["v"], rows["id"] = pixels[:, 0], pixels[:, 1], ids
+    rows = make_rows(_ROW, [*points.T, *pixels.T, ids])
     return make_cloud(make_message, stamp_ns, MAP_FRAME, rows)
 
 

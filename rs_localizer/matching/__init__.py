@@ -24,7 +24,7 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion
 from rs_localizer.estimation.prior import Prior, state_in
-from rs_localizer.io.clouds import Correspondences, Keypoints
+from rs_localizer.io.clouds import Correspondences, Keypoints, make_rows
 from rs_localizer.io.maps.landmarks import Descriptors, Ids, Map
 from rs_localizer.matching.kernels import (
     BestFound,
@@ -172,16 +172,8 @@ some hundreds, and detectors give one to two thousand."""
 _BORDER_PIXELS = 33
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SearchView:
-    """The landmarks that an image may show."""
-
-    landmarks: IntArray  # (v,)
-    gate: float  # px around the prediction
-
-
-def find_view(camera: Camera, prior: Prior, points: Array, least_gate: float) -> SearchView:
-    """Return the landmarks that some row may see, and the widest distance from a prediction.
+def predict_visible(camera: Camera, prior: Prior, points: Array, least_gate: float) -> Visible:
+    """Predict the pixels of the landmarks that some row may see, each at the time of its own row.
 
     Args:
         camera: of the image.
@@ -199,17 +191,9 @@ def find_view(camera: Camera, prior: Prior, points: Array, least_gate: float) ->
     in_view(points, state_in(prior.motion, np.zeros(3)), low - slack, high + slack, depths)
     near = np.flatnonzero(depths)
     if len(near) == 0:
-        return SearchView(near, float(least_gate))
+        return Visible(near, np.zeros((0, 2)), least_gate)
     deviation = focal * _bearing_deviation(prior.covariance, float(np.median(depths[near])))
-    return SearchView(near, float(min(max(least_gate, _DEVIATIONS * deviation), widest)))
-
-
-def predict_visible(camera: Camera, prior: Prior, points: Array, view: SearchView) -> Visible:
-    """Predict the pixels of the landmarks of a view, each at the time of its own row."""
-    assert prior.motion is not None
-    near, gate = view.landmarks, view.gate
-    if len(near) == 0:
-        return Visible(near, np.zeros((0, 2)), gate)
+    gate = float(min(max(least_gate, _DEVIATIONS * deviation), widest))
     pixels = _project(camera, prior.motion, points[near])
     limit = np.array(camera.size) - 0.5 + gate
     inside = np.flatnonzero(np.all((pixels > -0.5 - gate) & (pixels < limit), axis=1))
@@ -318,7 +302,7 @@ class Matcher:
         chosen = _best(keypoints, MOST_KEYPOINTS)
         queries, pixels = keypoints.descriptors[chosen], keypoints.pixels[chosen]
         if camera is not None and prior is not None:
-            matches, owners = self._predicted(queries, pixels, _GATE, camera, prior)
+            matches, owners = self._predicted(queries, pixels, camera, prior)
         else:
             matches, owners = self._anywhere(queries)
         return _accepted(matches, owners, chosen)
@@ -385,14 +369,12 @@ class Matcher:
         self,
         queries: Descriptors,
         pixels: Array,
-        gate: float,
         camera: Camera,
         prior: Prior,
     ) -> tuple[Nearest, IntArray]:
         """Find the two nearest of the landmarks predicted near each query, and its rival (q,)."""
         assert self._index is not None
-        view = find_view(camera, prior, self.map.points, gate)
-        visible = predict_visible(camera, prior, self.map.points, view)
+        visible = predict_visible(camera, prior, self.map.points, _GATE)
         nearest, owners = self._index.nearest_within(queries, pixels, visible)
         owner_of = np.full(len(self.map), -1, np.int64)
         owner_of[visible.landmarks] = owners
@@ -404,18 +386,15 @@ def correspondences(matches: Matches, keypoints: Keypoints, landmarks: Map) -> C
     points, pixels = landmarks.points[matches.landmarks], keypoints.pixels[matches.keypoints]
     kinds: list[tuple[str, Any]] = [(name, landmarks.point_type) for name in "xyz"]
     kinds += [("u", "<f4"), ("v", "<f4")]
+    columns: list[NDArray[Any]] = [*points.T, *pixels.T]
     if landmarks.ids is not None:
         kinds.append(("id", landmarks.id_type))
+        columns.append(landmarks.ids[matches.landmarks])
     if matches.scores is not None:
         kinds.append(("score", "<f4"))
-    table = np.empty(len(matches), kinds)
+        columns.append(matches.scores)
     with np.errstate(over="ignore"):  # pixels of 1e300 are no pixels in single precision either
-        for name, column in zip("xyzuv", [*points.T, *pixels.T], strict=True):
-            table[name] = column
-        if matches.scores is not None:
-            table["score"] = matches.scores
-    if landmarks.ids is not None:
-        table["id"] = landmarks.ids[matches.landmarks]
+        table = make_rows(kinds, columns)
     return Correspondences(
         stamp_ns=keypoints.stamp_ns,
         frame=landmarks.frame,

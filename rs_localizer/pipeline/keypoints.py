@@ -8,12 +8,10 @@ The node and the offline ``rs_localizer detect --features`` run this one class.
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numpy as np
-
 from rs_localizer.config import FeatureConfig
 from rs_localizer.core.reasons import Reason
 from rs_localizer.features.extraction import FeatureExtractor, Features
-from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.clouds import make_cloud, make_rows
 from rs_localizer.io.images import Image, read_any_image
 from rs_localizer.io.messages import Make
 from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
@@ -35,9 +33,8 @@ def keypoints(extracted: Extracted, make: Make) -> Any:
     features = extracted.features
     width = features.descriptors.shape[1]
     numbers = [(name, "<f4") for name in ("u", "v", "score")]
-    rows = np.empty(len(features), np.dtype([*numbers, ("descriptor", "u1", (width,))]))
-    rows["u"], rows["v"] = features.pixels.T
-    rows["score"], rows["descriptor"] = features.scores, features.descriptors
+    kinds = [*numbers, ("descriptor", "u1", (width,))]
+    rows = make_rows(kinds, [*features.pixels.T, features.scores, features.descriptors])
     return make_cloud(make, extracted.image.stamp_ns, extracted.image.frame, rows)
 
 

@@ -12,9 +12,8 @@ from typing import Any, Literal
 import numpy as np
 
 from rs_localizer.config import DetectorConfig
-from rs_localizer.core.arrays import Array
 from rs_localizer.core.reasons import Notice, Reason
-from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.clouds import make_cloud, make_rows, point_fields
 from rs_localizer.io.images import Image, read_any_image
 from rs_localizer.io.messages import Make
 from rs_localizer.markers.detection import Detections, MarkerDetector
@@ -40,7 +39,6 @@ class Detected:
     image: Image
     detections: Detections
     map: MarkerMap
-    row: np.dtype[Any]  # of the cloud
 
     def __bool__(self) -> Literal[True]:
         return True
@@ -49,18 +47,10 @@ class Detected:
 def correspondences(detected: Detected, make: Make) -> Any:
     """Make the sensor_msgs/PointCloud2 of an image, for node and bag alike."""
     detections = detected.detections
-    rows = np.empty(len(detections.ids), detected.row)
-    for column, name in enumerate("xyz"):
-        rows[name] = detections.points[:, column]
-    rows["u"], rows["v"] = detections.pixels[:, 0], detections.pixels[:, 1]
-    rows["score"], rows["id"] = detections.scores, detections.ids
+    kind = "<f8" if np.abs(detected.map.points).max() > _LARGE_MAP else "<f4"
+    columns = [*detections.points.T, *detections.pixels.T, detections.scores, detections.ids]
+    rows = make_rows(point_fields(kind), columns)
     return make_cloud(make, detected.image.stamp_ns, detected.map.map_frame, rows)
-
-
-def _row_type(points: Array) -> np.dtype[Any]:
-    kind = "<f8" if np.abs(points).max() > _LARGE_MAP else "<f4"
-    places = [(name, kind) for name in "xyz"]
-    return np.dtype([*places, ("u", "<f4"), ("v", "<f4"), ("score", "<f4"), ("id", "<u4")])
 
 
 class FrameDetector:
@@ -86,7 +76,6 @@ class FrameDetector:
         self.described = f"{markers} markers and {boards} boards in {marker_map.map_frame}"
         self._notice = notice
         self._detector = MarkerDetector(marker_map, _LEAST_SIDE)
-        self._row = _row_type(marker_map.points)
 
         # Fault of all images, as a sentence; empty: unknown.
         self.mistake = ""
@@ -114,7 +103,7 @@ class FrameDetector:
             self.mistake = self._mistakes.explain_frame(lambda: self._mirrored(image, corners))
             if self.mistake:
                 self._notice(Notice.WOULD_FIT, self.mistake)
-        return Detected(image, detections, self.map, self._row)
+        return Detected(image, detections, self.map)
 
     def _mirrored(self, image: Image, shown: int) -> str:
         """Return a warning if the mirrored image shows more corners than this one, or ``""``."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.reasons import Notice, Reason
-from rs_localizer.io.clouds import Correspondences
+from rs_localizer.io.clouds import Correspondences, make_rows, point_fields
 from rs_localizer.io.detections import TagDetections, read_detections
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap
@@ -74,12 +74,7 @@ class Tags:
         scores = np.repeat(sides.min(axis=1), 4)
         ids = (detections.ids[:, None] + np.arange(4)).ravel()
         points, pixels = self._points[ids], detections.corners.reshape(-1, 2)
-        names = [(name, "<f8") for name in "xyz"]
-        fields = [*names, ("u", "<f4"), ("v", "<f4"), ("score", "<f4"), ("id", "<u4")]
-        table = np.empty(len(scores), fields)
-        columns = [*points.T, *pixels.T, scores, ids]
-        for (name, _), column in zip(fields, columns, strict=True):
-            table[name] = column
+        table = make_rows(point_fields("<f8"), [*points.T, *pixels.T, scores, ids])
         return Correspondences(
             detections.stamp_ns, self._map.map_frame, points, pixels, scores, 0, table
         )

@@ -13,7 +13,7 @@ from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.clouds import Keypoints
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.matching import Matcher, find_view, predict_visible
+from rs_localizer.matching import Matcher, predict_visible
 from rs_localizer.tools.simulation.scene import room
 
 K = np.array([[400.0, 0.0, 319.5], [0.0, 410.0, 239.5], [0.0, 0.0, 1.0]])
@@ -44,7 +44,7 @@ def test_all_that_the_image_shows_is_predicted_where_it_is(name, points):
     pixels, _ = project_rolling(view, MOTION.at_rows, points)
     shown = np.flatnonzero(view.inside(pixels))
     assert len(shown) > 300
-    found = predict_visible(view, SURE, points, find_view(view, SURE, points, 20.0))
+    found = predict_visible(view, SURE, points, 20.0)
     assert found.gate == 20.0
     assert np.all(np.diff(found.pixels[:, 1]) >= 0.0)
     place = {row: k for k, row in enumerate(found.landmarks.tolist())}

@@ -137,10 +137,10 @@ def make_map(
     dropped = len(points) - int(np.count_nonzero(finite))
     if dropped:
         points = points[finite]
-        ids = None if ids is None else ids[finite]
-        descriptors = None if descriptors is None else descriptors[finite]
-        covariances = None if covariances is None else covariances[finite]
-        error_modes = None if error_modes is None else error_modes[finite]
+        ids, descriptors, covariances, error_modes = (
+            None if part is None else part[finite]
+            for part in (ids, descriptors, covariances, error_modes)
+        )
     if ids is not None:
         _check_ids(ids)  # before they are converted, which may wrap them
         ids = np.ascontiguousarray(ids, dtype=np.int64)
