@@ -8,7 +8,7 @@ disagree count more. While there is a track it says nothing: a filter's pose has
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,6 @@ PERIOD = 10.0
 """So often a pose is saved, in s."""
 # While nobody looked, a robot may have been moved as far as a click in RViz is uncertain: m, rad.
 _MOVED = np.diag(np.repeat((0.5, 0.26), 3)) ** 2
-_ORTHONORMAL = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,22 +72,33 @@ def read_given_pose(message: Any) -> GivenPose:
         MessageError: for numbers that are no pose or no covariance.
     """
     at, q = message.pose.pose.position, message.pose.pose.orientation
-    covariance = np.array(message.pose.covariance, float).reshape(6, 6)
+    return _given(
+        stamp_ns(message), message.header.frame_id, getattr(message, "child_frame_id", ""),
+        [at.x, at.y, at.z], [q.x, q.y, q.z, q.w], message.pose.covariance,
+    )  # fmt: skip
+
+
+def _given(
+    stamp: int, frame: str, body: str, position: Any, quaternion: Any, covariance: Any
+) -> GivenPose:
+    """Return a pose of position (3,), quaternion (4,) ``x y z w`` and covariance (36,) or (6,6).
+
+    Raises:
+        MessageError: for numbers that are no pose or no covariance.
+    """
     try:
-        pose = from_numbers((at.x, at.y, at.z), (q.x, q.y, q.z, q.w))
-    except TransformError as error:
+        x, y, z = map(float, position)
+        qx, qy, qz, qw = map(float, quaternion)
+        pose = from_numbers((x, y, z), (qx, qy, qz, qw))
+        spread = np.array(covariance, float).reshape(6, 6)
+    except (TypeError, ValueError) as error:
         raise MessageError(f"the given pose is none: {error}") from error
-    if not np.isfinite(covariance).all():
+    if not np.isfinite(spread).all():
         raise MessageError("the covariance of the given pose holds numbers that are not finite")
-    if (variances := covariance.diagonal()).min() < 0.0:
+    if (variances := spread.diagonal()).min() < 0.0:
         raise MessageError(f"the given pose has variances below zero: {variances.tolist()}")
-    return GivenPose(
-        stamp_ns(message),
-        message.header.frame_id.removeprefix("/"),
-        getattr(message, "child_frame_id", "").removeprefix("/"),
-        pose,
-        0.5 * (covariance + covariance.T),
-    )
+    names = frame.removeprefix("/"), body.removeprefix("/")
+    return GivenPose(stamp, *names, pose, 0.5 * (spread + spread.T))
 
 
 def save_pose(file: Path, map_frame: str, map_from_body: Transform, covariance: Array) -> None:
@@ -96,7 +106,7 @@ def save_pose(file: Path, map_frame: str, map_from_body: Transform, covariance: 
     text = json.dumps({
         "map_frame": map_frame,
         "position": map_from_body.translation.tolist(),
-        "rotation": map_from_body.rotation.tolist(),
+        "quaternion": so3.quaternion(np.ascontiguousarray(map_from_body.rotation)).tolist(),
         "covariance": covariance.tolist(),
     }, indent=1)  # fmt: skip
     with atomic_files(file) as (part,):
@@ -111,24 +121,13 @@ def load_pose(file: Path) -> GivenPose | None:
     """
     try:
         said = json.loads(file.read_text(encoding="utf-8"))
-        position, rotation, covariance = (
-            np.array(said[name], float) for name in ("position", "rotation", "covariance")
-        )
-        frame = str(said["map_frame"])
+        values = (said[name] for name in ("position", "quaternion", "covariance"))
+        given = _given(0, str(said["map_frame"]), "", *values)
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"saved_pose_file {file} holds no pose: {error!r}") from error
-    shapes = position.shape, rotation.shape, covariance.shape
-    if shapes != ((3,), (3, 3), (6, 6)) or not all(
-        np.isfinite(it).all() for it in (position, rotation, covariance)
-    ):
-        raise ValueError(f"saved_pose_file {file} holds no pose: numbers of shapes {shapes}")
-    turned = np.abs(rotation @ rotation.T - np.eye(3)).max() < _ORTHONORMAL
-    turned &= np.linalg.det(rotation) > 0.0
-    if not turned or np.linalg.eigvalsh(covariance).min() < -_ORTHONORMAL:
-        raise ValueError(f"saved_pose_file {file} holds no rotation or no covariance")
-    return GivenPose(0, frame, "", Transform(rotation, position), covariance + _MOVED)
+    return replace(given, covariance=given.covariance + _MOVED)
 
 
 class PosePrior:
