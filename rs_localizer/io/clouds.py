@@ -216,11 +216,8 @@ def select_inliers(table: NDArray[Any], inliers: NDArray[np.bool_], residuals: A
         residuals: (n,) px.
     """
     rows = np.flatnonzero(inliers)
-    kept = np.empty(len(rows), _packed(table.dtype))
-    for name in table.dtype.names or ():
-        kept[name] = table[name][rows]
-    kept["residual"] = residuals[rows]
-    return kept
+    kept = [table[name][rows] for name in table.dtype.names or ()]
+    return make_rows(_packed(table.dtype), [*kept, residuals[rows]])
 
 
 @lru_cache(maxsize=16)
@@ -229,10 +226,10 @@ def _packed(row_type: np.dtype[Any]) -> np.dtype[Any]:
     return np.dtype([(n, fields[n][0].newbyteorder("<")) for n in fields] + [("residual", "<f4")])
 
 
-def make_rows(kinds: Sequence[tuple[Any, ...]], columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return packed rows (k,) of these fields, from a column (k,...) of each."""
-    rows = np.empty(len(columns[0]), list(kinds))
-    for (name, *_), column in zip(kinds, columns, strict=True):
+def make_rows(kinds: Any, columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Return packed rows (k,) of these fields (a dtype), from a column (k,...) of each."""
+    rows = np.empty(len(columns[0]), kinds)
+    for name, column in zip(rows.dtype.names or (), columns, strict=True):
         rows[name] = column
     return rows
 

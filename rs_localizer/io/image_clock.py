@@ -26,43 +26,34 @@ class ImageClock:
         rate: images per second instead of the file's own times; None: these.
         missing: sentence on images that could not be read.
         captured: images per second that the camera took, by a note of the file; None: unknown.
+        absolute: the images' own times are names of files, and not a video's since its start.
     """
 
     rate: float | None = None
     missing: str | None = None
     captured: float | None = None
+    absolute: bool = False
     _images: int = 0
     _first_ns: int = 0  # own time of the first image
     _last_ns: int = 0  # own time of the last image that has one
     _timed: int = 0  # images with a time of their own, before any rate
-    _absolute: bool = False
-
-    def relative(self, own_ns: int | None) -> int | None:
-        """Return the stamp of a video's next image by its presentation time; None if unknown.
-
-        Raises:
-            TimesError: when the file has no times and no rate was given.
-        """
-        return self._stamp(own_ns)
-
-    def absolute(self, own_ns: int) -> int:
-        """Return the stamp of the next file of a folder whose names are times."""
-        self._absolute = True
-        stamp = self._stamp(own_ns)
-        assert stamp is not None
-        return stamp
 
     @property
     def _zero_ns(self) -> int:
         """Stamp of the zero of the file's clock."""
-        return 0 if self._absolute else DEFAULT_START_NS
+        return 0 if self.absolute else DEFAULT_START_NS
 
     @property
     def _start_ns(self) -> int:
         """Stamp of the first image, of those that come at a rate."""
-        return self._first_ns if self._absolute else DEFAULT_START_NS
+        return self._first_ns if self.absolute else DEFAULT_START_NS
 
-    def _stamp(self, own_ns: int | None) -> int | None:
+    def stamp(self, own_ns: int | None) -> int | None:
+        """Return the stamp of the next image by its own time; None if unknown.
+
+        Raises:
+            TimesError: when the file has no times and no rate was given.
+        """
         index = self._images
         self._images += 1
         if own_ns is not None:
@@ -84,7 +75,7 @@ class ImageClock:
 
     def description(self) -> str:
         """Describe the origin of the stamps in one sentence."""
-        own = "the names of the files" if self._absolute else "the presentation times of the video"
+        own = "the names of the files" if self.absolute else "the presentation times of the video"
         source = own if self.rate is None else f"--rate {self.rate:g}"
         own_rate = self.own_rate
         pace = f", {own_rate:.4g} images/s on average" if own_rate and self.rate is None else ""

@@ -66,7 +66,7 @@ def from_video(path: Path, camera: Camera | None, clock: ImageClock) -> Iterator
     """
     video, frame = Video(path), CAMERA_FRAME
     for jpeg, gray, seconds in video:
-        now = clock.relative(None if seconds is None else round(1e9 * seconds))
+        now = clock.stamp(None if seconds is None else round(1e9 * seconds))
         if now is None:
             lost = Refusal(Reason.NO_STAMP, "it has no presentation time")
             yield Shot(lost, _info(camera, 0, frame), None, 0)
@@ -79,9 +79,9 @@ def from_video(path: Path, camera: Camera | None, clock: ImageClock) -> Iterator
 def from_files(files: list[Path], camera: Camera | None, clock: ImageClock) -> Iterator[Shot]:
     """Yield images of files; their names are times in ns, or they follow at a rate."""
     times = name_times(files)
+    clock.absolute = times is not None
     for file in files:
-        own = None if times is None else times[file]
-        now = clock.relative(None) if own is None else clock.absolute(own)
+        now = clock.stamp(None if times is None else times[file])
         assert now is not None  # a clock without a rate has refused
         packed = _FORMATS[file.suffix.lower()]
         compressed = make_image(now, packed, file.read_bytes())

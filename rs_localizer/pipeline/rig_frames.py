@@ -28,6 +28,7 @@ from rs_localizer.io.camera_info import Calibration
 from rs_localizer.io.clouds import (
     Correspondences,
     Keypoints,
+    make_rows,
     read_correspondences,
     read_keypoints,
 )
@@ -172,20 +173,14 @@ def joined(names: Sequence[str], images: Sequence[CameraImage]) -> Correspondenc
 
 def _table(names: Sequence[str], images: Sequence[CameraImage]) -> NDArray[Any]:
     """Return the rows of all images, with the fields that all have, and their camera."""
-    types = [image.cloud.table.dtype for image in images]
-    fields = [name for name in types[0].names or () if all(name in (t.names or ()) for t in types)]
-    kinds: list[tuple[str, Any]] = [
-        (name, np.result_type(*(t[name].newbyteorder("<") for t in types))) for name in fields
-    ]
-    rows = np.empty(sum(len(image.cloud.table) for image in images), [*kinds, ("camera", "u1")])
-    first = 0
-    for image in images:
-        last = first + len(image.cloud.table)
-        for name in fields:
-            rows[name][first:last] = image.cloud.table[name]
-        rows["camera"][first:last] = names.index(image.camera)
-        first = last
-    return rows
+    tables = [image.cloud.table for image in images]
+    known = [table.dtype.names or () for table in tables]
+    fields = [name for name in known[0] if all(name in others for others in known)]
+    columns = [np.concatenate([table[name] for table in tables]) for name in fields]
+    kinds = [(name, of.dtype.newbyteorder("<")) for name, of in zip(fields, columns, strict=True)]
+    places = [names.index(image.camera) for image in images]
+    columns.append(np.repeat(places, [len(table) for table in tables]))
+    return make_rows([*kinds, ("camera", "u1")], columns)
 
 
 def share_of(image: CameraImage, result: RigEstimate) -> CameraShare:

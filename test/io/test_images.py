@@ -238,23 +238,23 @@ OWN = [ms * 1_000_000 for ms in (0, 33, 67, 100, 300)]
 )  # fmt: skip
 def test_times_of_a_video_begin_at_one_second(rate, stamps, described, fault):
     clock = ImageClock(rate)
-    assert [clock.relative(own) for own in OWN] == [10**9 + stamp for stamp in stamps]
+    assert [clock.stamp(own) for own in OWN] == [10**9 + stamp for stamp in stamps]
     assert described in clock.description()
-    assert (clock.relative(None) is None) == (rate is None)
+    assert (clock.stamp(None) is None) == (rate is None)
     assert clock.fault() is None if fault is None else fault in clock.fault()
 
 
 def test_times_of_names_and_none():
-    clock = ImageClock()
-    assert [clock.absolute(10**18 + k) for k in (0, 7)] == [10**18, 10**18 + 7]
+    clock = ImageClock(absolute=True)
+    assert [clock.stamp(10**18 + k) for k in (0, 7)] == [10**18, 10**18 + 7]
     assert "the names of the files" in clock.description()
     clock = ImageClock(rate=30.0)
-    assert (clock.relative(None), clock.fault()) == (10**9, None)
+    assert (clock.stamp(None), clock.fault()) == (10**9, None)
     clock = ImageClock()
-    clock.relative(0)  # the first of some files has a time, always
+    clock.stamp(0)  # the first of some files has a time, always
     for without in (ImageClock(), clock):
         with pytest.raises(TimesError, match="give --rate"):
-            without.relative(None)
+            without.stamp(None)
 
 
 def test_a_readout_longer_than_a_period():

@@ -159,6 +159,6 @@ def test_images_that_begin_late_have_the_clock_of_the_file(tmp_path):
     times = [item.seconds for item in Video(path)]
     assert times == pytest.approx([0.854 + 0.1 * k for k in range(12)], abs=1e-6)
     clock = ImageClock()
-    stamps = [clock.relative(round(1e9 * seconds)) for seconds in times]
+    stamps = [clock.stamp(round(1e9 * seconds)) for seconds in times]
     assert stamps[0] == pytest.approx(1_854_000_000, abs=10)
     assert "the first image at 1.854 s" in clock.description()
