@@ -73,37 +73,36 @@ class Problem:
     def _columns(self, start: Unknowns) -> None:
         """Number all unknowns: controls, each camera's border, landmarks of all, gyroscope."""
         controls = CONTROL * len(start.spline.positions)
-        self.at: list[dict[str, int]] = []
-        column, eliminated = controls, 0
-        for view, pieces, own in zip(self.views, self.pieces, (start, *start.others), strict=True):
-            free, at = view.freedom, dict[str, int]()
-            for name, size in (
-                ("readout", int(free.readout_time)),
-                ("lens", len(own.lens) if free.lens else 0),
-                ("mount", EXTRINSICS if free.mount else 0),
-                ("points", 0 if self.deviations is not None else pieces.columns),
-            ):
-                if size:
-                    at[name] = column
-                    column += size
-            self.at.append(at)
+        states, column = (start, *start.others), controls
+        self.at: list[dict[str, slice]] = [{} for _ in states]  # by camera and name
+
+        def number(view: int, name: str, size: int) -> None:
+            nonlocal column
+            if size:
+                self.at[view][name] = slice(column, column + size)
+                column += size
+
+        for k, own in enumerate(states):
+            free = self.views[k].freedom
+            number(k, "readout", int(free.readout_time))
+            number(k, "lens", len(own.lens) if free.lens else 0)
+            number(k, "mount", EXTRINSICS if free.mount else 0)
+            if self.deviations is None:
+                number(k, "points", self.pieces[k].columns)
         self.gyro: Gyroscope | None = None
         gyro = self.views[0].observations.gyro
         if gyro is not None and start.mount is not None:
             self.gyro = Gyroscope(gyro, start)
-            self.at[0]["gyro"] = column
-            column += MOUNT
-        width = 1
-        if self.deviations is not None:
-            width, eliminated = 3, len(self.deviations)
-            for at in self.at:
-                at["points"] = column
-        else:
-            for at, view, own in zip(self.at, self.views, (start, *start.others), strict=True):
-                if view.freedom.stamps > 0.0:
-                    at["delays"] = column + eliminated
-                    eliminated += len(own.delays)
-        self.groups = Groups(controls, column - controls, eliminated, width)
+            number(0, "gyro", MOUNT)
+        kept = column
+        for k, own in enumerate(states):
+            if self.deviations is not None:  # the landmarks are those of all cameras
+                column = kept
+                number(k, "points", self.pieces[k].columns)
+            elif self.views[k].freedom.stamps > 0.0:
+                number(k, "delays", len(own.delays))
+        width = 1 if self.deviations is None else 3
+        self.groups = Groups(controls, kept - controls, (column - kept) // width, width)
 
     @property
     def border(self) -> int:
@@ -112,7 +111,7 @@ class Problem:
 
     def place(self, name: str, view: int = 0) -> int:
         """Return the index of a camera's first number in the border."""
-        return self.at[view][name] - self.groups.motion
+        return int(self.at[view][name].start) - self.groups.motion
 
     def states(self, state: Unknowns) -> list[Unknowns]:
         """Return the unknowns of each camera, on one spline."""
@@ -155,7 +154,7 @@ class Problem:
         if self.floating is not None:
             terms.append(self.floating.rows(state.spline))
         if self.gyro is not None:
-            terms += self.gyro.terms(state, self.at[0]["gyro"])
+            terms += self.gyro.terms(state, self.at[0]["gyro"].start)
         return terms
 
     def _expected_motion(self, state: Unknowns) -> list[Rows]:
@@ -172,7 +171,7 @@ class Problem:
         freedom = view.freedom
         if "lens" in at:
             mean, information = self._lens_priors[k]
-            terms.append(known(own.lens - mean, information, at["lens"]))
+            terms.append(known(own.lens - mean, information, at["lens"].start))
         if "points" in at and self.deviations is None:
             if pieces.rigid:  # a body none of whose landmarks fits stays where it is
                 information = np.full(pieces.columns, _LOOSE_BODY**-2)
@@ -183,10 +182,10 @@ class Problem:
                 information = np.full(pieces.columns, max(freedom.landmarks, 1e-12) ** -2)
             shape = self._shapes[k]
             matrix = np.diag(information) if shape is None else shape
-            terms.append(known(offset, matrix, at["points"]))
+            terms.append(known(offset, matrix, at["points"].start))
         if "delays" in at:
             deviations = np.full(len(own.delays), freedom.stamps)
-            terms.append(block_rows(own.delays[:, None], deviations, at["delays"]))
+            terms.append(block_rows(own.delays[:, None], deviations, at["delays"].start))
         return terms
 
     def moved(self, state: Unknowns, step: Array) -> Unknowns:
@@ -195,25 +194,22 @@ class Problem:
         states = enumerate(self.states(state))
         first, *others = (self._camera_moved(k, own, step) for k, own in states)
         if self.gyro is not None and state.mount is not None:
-            at = self.at[0]["gyro"]
-            first = replace(first, mount=state.mount.moved(step[at : at + MOUNT]))
+            first = replace(first, mount=state.mount.moved(step[self.at[0]["gyro"]]))
         return replace(first, spline=spline, others=tuple(others))
 
     def _camera_moved(self, k: int, own: Unknowns, step: Array) -> Unknowns:
-        at, pieces = self.at[k], self.pieces[k]
-        changed: dict[str, object] = {}
-        if "readout" in at:
-            changed["readout_time"] = own.readout_time + float(step[at["readout"]])
-        if "lens" in at:
-            changed["lens"] = own.lens + step[at["lens"] : at["lens"] + len(own.lens)]
-        if "mount" in at:
-            changed["extrinsics"] = own.extrinsics.moved(step[at["mount"] :][:EXTRINSICS])
-        if "points" in at:
-            own_step = step[at["points"] :][: pieces.columns]
-            changed["landmarks"] = pieces.moved(own.landmarks, own_step)
-        if "delays" in at:
-            changed["delays"] = own.delays + step[at["delays"] :][: len(own.delays)]
-        return replace(own, **changed)  # type: ignore[arg-type]
+        by = {name: step[place] for name, place in self.at[k].items()}
+        if "readout" in by:
+            own = replace(own, readout_time=own.readout_time + float(by["readout"][0]))
+        if "lens" in by:
+            own = replace(own, lens=own.lens + by["lens"])
+        if "mount" in by:
+            own = replace(own, extrinsics=own.extrinsics.moved(by["mount"]))
+        if "points" in by:
+            own = replace(own, landmarks=self.pieces[k].moved(own.landmarks, by["points"]))
+        if "delays" in by:
+            own = replace(own, delays=own.delays + by["delays"])
+        return own
 
     def errors(self, state: Unknowns) -> Array:
         """Return the squared whitened errors (n,), px^2 of the first camera."""

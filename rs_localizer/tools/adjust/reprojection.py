@@ -18,7 +18,6 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.tools.adjust.bodies import Pieces
 from rs_localizer.tools.adjust.intrinsics import project
 from rs_localizer.tools.adjust.row_kernels import (
-    EXTRINSICS,
     Curve,
     Projections,
     Terms,
@@ -84,24 +83,23 @@ class Reprojection:
         squared_errors(sights, self.terms(own, 1.0), squared)
         return squared
 
-    def rows(self, curve: Curve, own: Unknowns, at: Mapping[str, int], deviation: float) -> Rows:
+    def rows(self, curve: Curve, own: Unknowns, at: Mapping[str, slice], deviation: float) -> Rows:
         """Return the whitened rows.
 
         Args:
-            at: where the camera's unknowns begin among all.
+            at: places of the camera's unknowns among all, by name.
             deviation: px, of the noise.
         """
         sights, seen = self.projections(curve, own), self.observations
         terms, count = self.terms(own, deviation), len(sights.first)
-        sizes = {"readout": 1, "lens": len(own.lens), "mount": EXTRINSICS}
-        shared = [at[name] + np.arange(size) for name, size in sizes.items() if name in at]
-        others = [np.tile(np.concatenate([*shared, np.zeros(0, int)]), (count, 1))]
+        shared = [at[name] for name in ("readout", "lens", "mount") if name in at]
+        others = [np.tile(np.r_[(*shared, np.zeros(0, int))], (count, 1))]
         if terms.point_width:
             slots = self.pieces.slots[seen.points][:, None]
-            places = at["points"] + terms.point_width * slots + np.arange(terms.point_width)
+            places = at["points"].start + terms.point_width * slots + np.arange(terms.point_width)
             others.append(np.where(slots < 0, -1, places))
         if terms.delay_free:
-            others.append(at["delays"] + seen.frames[:, None])
+            others.append(at["delays"].start + seen.frames[:, None])
         columns = np.ascontiguousarray(np.concatenate(others, axis=1), np.int64)
         values = np.empty((count, 2, LOCAL + columns.shape[1]))
         errors = np.empty((count, 2))

@@ -89,7 +89,7 @@ FADING = replace(ACCELERATIONS, fading=0.1)
         (lambda problem, start, one: rest_rows(one.spline, 2.0, 1.0), 0.04),  # images alone
         (lambda problem, start, one: Floating(start.spline).rows(one.spline), 0.4),
         (lambda problem, start, one: block_rows(
-            one.delays[:, None], np.full(5, 0.5), problem.at[0]["delays"]), 0.4),
+            one.delays[:, None], np.full(5, 0.5), problem.at[0]["delays"].start), 0.4),
     ],
     ids=["accelerations", "fading", "rest", "the whole", "blocks"],
 )  # fmt: skip
@@ -107,7 +107,7 @@ def test_a_gyroscope():
     problem = Problem([replace(problem.views[0], observations=seen)], state)
     # So that Tukey's weights are one.
     gyro = Gyroscope(samples, state)
-    are_derivatives(lambda one: gyro.terms(one, problem.at[0]["gyro"])[0], problem, state)
+    are_derivatives(lambda one: gyro.terms(one, problem.at[0]["gyro"].start)[0], problem, state)
 
 
 @pytest.mark.parametrize(
