@@ -358,7 +358,7 @@ def _built(film: Film, room: Array, markers: int, rng: np.random.Generator) -> B
     rows = np.arange(count)
     inputs = Given(views, camera, anchors, _READOUT, str(camera.scan_direction))
     descriptors = np.zeros((len(room), 1), np.float32)
-    structure = Structure(rows, seen, start, descriptors, camera, (count,), 0.0)
+    structure = Structure(rows, seen, start, descriptors, camera, (count,))
     return built_from(
         inputs, structure, (rows, seen, start), camera,
         lambda name, total: nullcontext(lambda steps: None),

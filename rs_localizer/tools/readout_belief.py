@@ -145,14 +145,10 @@ class Evidence:
         return sum(block.deviation < self.limit for block in self.blocks)
 
     @property
-    def long_enough(self) -> bool:
-        """True where parts of it can speak against the whole."""
-        return self.telling >= _LEAST_TELLING or self.seconds >= _LONG
-
-    @property
     def determined(self) -> bool:
-        """True where the motion determines the readout time."""
-        return self.deviation < self.limit and self.long_enough
+        """True where the motion determines the readout time, and parts can speak against it."""
+        long_enough = self.telling >= _LEAST_TELLING or self.seconds >= _LONG
+        return self.deviation < self.limit and long_enough
 
     @property
     def near_zero(self) -> bool:
@@ -181,23 +177,12 @@ class Evidence:
         return bool((self.inflation > 1.0 and scatter > least) or by_halves)
 
     @property
-    def parts(self) -> str:
-        """The values of the blocks, ms, along the direction that is told."""
-        return ", ".join(f"{1e3 * self.sense * one.readout_time:.2f}" for one in self.blocks)
-
-    @property
-    def disbelief(self) -> str:
-        """One line with the figure when the readout time is not determined; or ''."""
-        value = f"{1e3 * self.sense * self.readout_time:.1f} +- {1e3 * self.deviation:.1f} ms"
-        why = self._why_not()
-        return f"not observable: {value}{why}" if why else ""
-
-    @property
     def processed(self) -> str:
         """Why the film is hardly what the camera saw, one sentence; '': nothing says so."""
         why = []
         if self.stabilised:
-            why.append(f"parts of the recording disagree ({self.parts} ms)")
+            parts = ", ".join(f"{1e3 * self.sense * one.readout_time:.2f}" for one in self.blocks)
+            why.append(f"parts of the recording disagree ({parts} ms)")
         if self.jitter > _BESIDE:
             why.append(f"exposures are {1e3 * self.jitter:.1f} ms rms off their stamps")
         return (
@@ -207,37 +192,32 @@ class Evidence:
             else ""
         )
 
-    def _why_not(self) -> str:
-        """Return the reason against it, as it goes on from the value; or ''."""
-        if self.processed:
-            return f"; {self.processed}"
-        if abs(self.readout_time) > _LONGEST * self.stamps.interval:
-            return (
-                f" is longer than the interval between images, "
-                f"{1e3 * self.stamps.interval:.1f} ms: are the stamps, or the frame rate, right?"
-            )
-        if not self.long_enough:
-            return (
-                f"; {self.telling} of {len(self.blocks)} parts of the "
-                f"{self.seconds:.1f} s determine it on their own, three must, or 9 s: move the "
-                "camera faster and for longer"
-            )
-        if not self.determined:
-            return (
-                f" (limit {1e3 * self.limit:.1f} ms); "
-                "move the camera faster, rotate it about all axes, and for longer"
-            )
+    @property
+    def disbelief(self) -> str:
+        """One line with the figure when the readout time is not determined; or ''."""
+        interval = 1e3 * self.stamps.interval
         slowest = abs(self.readout_time) + _GLOBAL_SIGMAS * self.deviation
-        if not (self.near_zero or self.own_stamps) and slowest < _GLOBAL:
-            return "; no rolling shutter is that fast: was the video stabilized or processed?"
-        if self.near_zero and not self.global_shutter:
-            reason = (
-                "three deviations are more than 2 ms" if self.inflation == 1.0 and self.own_stamps
-                else "its parts differ" if self.own_stamps
-                else "the stamps are those of a constant rate, as of a video that was processed"
-            )  # fmt: skip
-            return f"; that is no proof of a global shutter: {reason}"
-        return ""
+        if self.processed:
+            why = f"; {self.processed}"
+        elif abs(self.readout_time) > _LONGEST * self.stamps.interval:
+            why = f" is longer than {interval:.1f} ms between images: is the frame rate right?"
+        elif not self.determined:
+            why = (
+                f" (limit {1e3 * self.limit:.1f} ms; {self.telling} of {len(self.blocks)} parts of "
+                f"the {self.seconds:.1f} s determine it on their own, three must, or 9 s): move "
+                "the camera faster, rotate it about all axes, and for longer"
+            )
+        elif not (self.near_zero or self.own_stamps) and slowest < _GLOBAL:
+            why = "; no rolling shutter is that fast: was the video stabilized or processed?"
+        elif self.near_zero and not self.global_shutter:
+            why = (
+                "; that is no proof of a global shutter: three deviations are more than 2 ms, its "
+                "parts differ, or the stamps are those of a video that was processed"
+            )
+        else:
+            return ""
+        value = 1e3 * self.sense * self.readout_time
+        return f"not observable: {value:.1f} +- {1e3 * self.deviation:.1f} ms{why}"
 
 
 def apart_of(halves: tuple[Block, ...]) -> tuple[float, float]:
@@ -262,9 +242,6 @@ class ShutterFit:
     readout_time: float  # s, of the rolling shutter that fits best
     deviation: float  # s
     direction: ScanDirection
-    noise: float  # px, that it leaves
-    global_noise: float  # px, that the global shutter leaves which fits best
-    better_images: float  # share of the images that fit it better than a global shutter
     chance: float  # that the images' gains over a global shutter are so by chance
     interval: float  # s, between the images
 

@@ -6,6 +6,7 @@ import json
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -56,7 +57,7 @@ def test_table(files, capsys):
     picture = files / "errors.png"
     words = ["evaluate", str(files / "replayed"), str(files / "truth"), "--plot", str(picture)]
     assert main(words) == 0
-    assert picture.is_file()
+    assert cv2.imread(str(picture)).shape[1] == 1300
     text = capsys.readouterr().out
     assert "40 of 40 poses compared" in text
     found = rows(text)
@@ -107,5 +108,3 @@ def test_clocks_that_differ_are_mended(files, tmp_path, capsys):
     told = json.loads(capsys.readouterr().out)["result"]
     assert told["position_median_m"] < 1e-6
     assert all(key.isidentifier() for key in told)
-    assert evaluate(files, "--offset", "soon", estimate="late.txt") == 2
-    assert "--offset: must be a number, got 'soon'" in capsys.readouterr().err

@@ -3,7 +3,6 @@
 """``rs_localizer replay``: three kinds of recordings in, poses and twists out, faults in a line."""
 
 import dataclasses
-import re
 import weakref
 from collections import Counter
 from pathlib import Path
@@ -203,17 +202,3 @@ def test_frames_are_written_as_they_come_and_let_go(recording, tmp_path, monkeyp
     assert main(["replay", str(recording), "--out", str(tmp_path / "out"), *SHUTTER]) == 0
     assert len(read_tum(tmp_path / "out" / "poses.txt")) == 300
     assert most < 10
-
-
-def test_notices_stand_in_the_summary(recording, tmp_path, monkeypatch, ran):
-    real = results.replay
-
-    def odd(bag: Any, topics: Any, localizer: Any) -> Any:
-        for k, item in enumerate(real(bag, topics, localizer)):
-            localizer._notice("readout_time", f"estimated readout time {k} ms differs")
-            yield item
-
-    monkeypatch.setattr(results, "replay", odd)
-    said = ran("replay", recording, "--out", tmp_path / "out", *SHUTTER).out
-    assert re.search(rf"noticed: readout_time +{FRAMES}\n", said)
-    assert f"readout_time: estimated readout time {FRAMES - 1} ms differs" in said

@@ -55,7 +55,7 @@ def look_at_images(args: Options, points: Sequence[_Point], looker: Looker) -> L
         total=source.total, unit="image", desc="look", disable=None
     ) as bar:  # fmt: skip
         moments = [seconds for _, seconds, _, _ in points]
-        looked = look_through(source.shots, looker, args.images_per_second, moments, bar.update)
+        looked = look_through(source.shots, looker, _IMAGES_PER_SECOND, moments, bar.update)
     if not looked.views:
         why = "; ".join(looked.refused.values())
         raise ValueError(f"{args.recording} has no image that can be read; {why}")
@@ -85,9 +85,6 @@ class Options(ImageOptions, ResultOptions):
     distance: list[tuple[str, str, str]] = option(
         "between two of these points", "NAME NAME METRES", list
     )
-    images_per_second: float = option(
-        "of a video that are used, at most", "N", _IMAGES_PER_SECOND, above=0.0,
-    )  # fmt: skip
 
 
 def run(args: Options) -> None:
@@ -165,7 +162,7 @@ def _write(out: Path, built: Built, looked: Looked) -> None:
 
 def _print_result(args: Options, built: Built, looked: Looked) -> None:
     print(args.out / MAP)
-    for name, text in rows(built, looked.images, len(looked.views)):
+    for name, text in rows(built, looked.images, len(looked.views)).items():
         print(f"  {name:30} {text}")
     if not built.placement.scaled:
         print(

@@ -41,18 +41,19 @@ from rs_localizer.tools.mapping.anchors import (
 )
 from rs_localizer.tools.mapping.gauge import Similarity, laid_on_held, scaled
 from rs_localizer.tools.mapping.map_keypoints import ADJUSTED, MapObservations, Start, adjusted_part
-from rs_localizer.tools.mapping.refinement import DRIFT, RefinedMap
+from rs_localizer.tools.mapping.refinement import (
+    DRIFT,
+    LEAST_FIT,
+    RefinedMap,
+    colmap_freedom,
+    likely_axis,
+    refine_with_shutter,
+)
 from rs_localizer.tools.mapping.seen_images import (
     LEAST_VIEWS,
     SeenImage,
     check_views,
     choose_keyframes,
-)
-from rs_localizer.tools.mapping.shutter_fit import (
-    LEAST_FIT,
-    colmap_freedom,
-    likely_axis,
-    refine_with_shutter,
 )
 from rs_localizer.tools.mapping.structure import Stage, Structure, build_structure
 from rs_localizer.tools.mapping.triangulation import Sights, Triangulated, moves, triangulate

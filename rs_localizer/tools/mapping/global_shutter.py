@@ -23,8 +23,8 @@ from rs_localizer.tools.adjust.reprojection import LIMIT
 from rs_localizer.tools.mapping import MappingError
 from rs_localizer.tools.mapping.build import ViewMotion, usual_size
 from rs_localizer.tools.mapping.map_keypoints import ADJUSTED, LEAST_KEYPOINTS, adjusted_part
-from rs_localizer.tools.mapping.refinement import RefinedMap
-from rs_localizer.tools.mapping.shutter_fit import (
+from rs_localizer.tools.mapping.refinement import (
+    RefinedMap,
     colmap_freedom,
     global_errors,
     likely_axis,

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rs_localizer.core.arrays import BoolArray
 from rs_localizer.tools.mapping.build import Built
 from rs_localizer.tools.mapping.map_keypoints import MapObservations
 from rs_localizer.tools.mapping.seen_images import SeenImage
@@ -20,61 +19,58 @@ _MANY = 0.1
 _AGAIN, _ENDS = 0.1, 0.1
 
 
-def rows(built: Built, images: int, views: int) -> list[tuple[str, str]]:
-    """Return the table of results: name and text.
+def rows(built: Built, images: int, views: int) -> dict[str, str]:
+    """Return the table of results.
 
     Args:
         images: of the recording.
         views: of them that were looked at.
     """
-    refined, covariances, structure = built.refined, built.landmarks.covariances, built.structure
-    modes = built.landmarks.error_modes
-    assert covariances is not None
-    assert modes is not None
-    spread = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
-    shared = np.linalg.norm(modes, axis=(1, 2))
+    refined, landmarks = built.refined, built.landmarks
+    assert landmarks.covariances is not None
+    spread = np.sqrt(np.trace(landmarks.covariances, axis1=1, axis2=2))
     unit = "mm" if built.placement.scaled else "units of the map / 1000"
-    joined = f"{structure.parts[0]} of {len(built.keyframes)}"
-    others = structure.parts[1:]
-    return [
-        ("images", f"{images}, {views} used"),
-        ("keyframes registered by COLMAP", joined + (f"; other parts: {others}" if others else "")),
-        ("reprojection error of COLMAP", f"{structure.error:.2f} px (mean)"),
-        ("images with a pose", f"{len(built.posed)} of {views}"),
-        ("landmarks", f"{len(built.landmarks)} of {len(structure.start.points)} points"),
-        ("deviation of a landmark", f"{1e3 * np.median(spread):.1f} {unit} (median)"),
-        ("deviation that landmarks share", f"{1e3 * np.median(shared):.1f} {unit} (median)"),
-        ("noise before the refinement", f"{refined.before:.2f} px"),
-        ("noise after it", f"{refined.after:.2f} px"),
-        *_of_shutter(built),
-        ("lens", _lens(built)),
-        ("scale", built.placement.basis),
-        ("z is up", built.placement.up),
-    ]
+    return {
+        "images": f"{images}, {views} used, {len(built.posed)} with a pose",
+        "landmarks": f"{len(landmarks)} of {len(built.structure.start.points)} points",
+        "deviation of a landmark": f"{1e3 * np.median(spread):.1f} {unit} (median)",
+        "deviation that landmarks share": f"{_shared(built):.1f} {unit} (median)",
+        "noise": f"{refined.before:.2f} px, after the refinement {refined.after:.2f} px",
+        "readout time": _shutter(built),
+        "scale": built.placement.basis,
+        "z is up": built.placement.up,
+    }
+
+
+def _shared(built: Built) -> float:
+    """Return the median deviation that a landmark shares with others, in 1/1000 of the map."""
+    assert built.landmarks.error_modes is not None
+    return 1e3 * float(np.median(np.linalg.norm(built.landmarks.error_modes, axis=(1, 2))))
 
 
 def advice(built: Built, views: Sequence[SeenImage]) -> list[str]:
     """Return sentences on how to film a better map."""
-    assert built.landmarks.error_modes is not None
     said = []
-    posed = np.zeros(len(views), np.bool_)
-    posed[built.posed] = True
-    start = views[0].stamp_ns
-    seconds = np.array([1e-9 * (view.stamp_ns - start) for view in views])
-    if np.mean(~posed) > _MANY:
-        said.append(f"{_when(~posed, seconds)}, images have no pose: film there more slowly")
+    lost = np.ones(len(views), np.bool_)
+    lost[built.posed] = False
+    if np.mean(lost) > _MANY:
+        rows_lost = np.flatnonzero(lost)[[0, -1]].tolist()
+        begin, last = (1e-9 * (views[k].stamp_ns - views[0].stamp_ns) for k in rows_lost)
+        said.append(
+            f"{np.mean(lost):.0%} of the images, from {begin:.1f} to {last:.1f} s, have no pose: "
+            "film there more slowly"
+        )
     if len(built.structure.parts) > 1:
         said.append(
             f"{sum(built.structure.parts[1:])} keyframes are not connected with the others: film "
             "what lies between, and come back to where you began"
         )
     if not comes_back(built.structure.seen):
-        shared = 1e3 * np.median(np.linalg.norm(built.landmarks.error_modes, axis=(1, 2)))
         unit = "mm" if built.placement.scaled else "thousandths of the map's unit"
         said.append(
             f"the last images show nothing that the first ones do: landmarks share errors of "
-            f"{shared:.1f} {unit}, larger ones towards the ends; come back to where you began, or "
-            "show markers at both ends"
+            f"{_shared(built):.1f} {unit}, larger ones towards the ends; come back to where you "
+            "began, or show markers at both ends"
         )
     shutter = built.shutter
     known = shutter.visible if shutter else not built.refined.apart
@@ -95,40 +91,14 @@ def comes_back(seen: MapObservations) -> bool:
     return len(np.intersect1d(first, last)) >= _AGAIN * min(len(first), len(last))
 
 
-def _of_shutter(built: Built) -> list[tuple[str, str]]:
+def _shutter(built: Built) -> str:
     fit, known = built.shutter, built.camera.readout_time
     if fit is None:
-        text = f"{1e3 * known:.2f} ms (given)" if known else "unknown, or none"
         if built.refined.apart:
-            text = "invisible: no smooth motion joins the images, each has a pose of its own"
-        return [("readout time", text)]
+            return "invisible: no smooth motion joins the images, each has a pose of its own"
+        return f"{1e3 * known:.2f} ms (given)" if known else "unknown, or none"
     best = f"{1e3 * fit.readout_time:.2f} +- {1e3 * fit.deviation:.2f} ms, {fit.direction}"
-    why = "" if fit.possible else f", longer than {1e3 * fit.interval:.1f} ms between images"
-    noises = (
-        f"{fit.noise:.3f} px, with a global shutter {fit.global_noise:.3f} px; "
-        f"{100 * fit.better_images:.0f} % of the images fit better"
-    )
     if fit.visible:
-        return [("readout time", f"{best} (estimated)"), ("noise with that", noises)]
-    return [
-        ("readout time", f"invisible in these images (best fit {best}{why})"),
-        ("noise with that", noises),
-    ]
-
-
-def _lens(built: Built) -> str:
-    camera = built.camera
-    if camera.K[0, 0] == built.structure.camera.K[0, 0]:
-        return "as calibrated"
-    coefficients = ", ".join(f"{value:.4f}" for value in camera.D)
-    return (
-        f"estimated: focal length {camera.K[0, 0]:.1f}, {camera.K[1, 1]:.1f} px, centre "
-        f"{camera.K[0, 2]:.1f}, {camera.K[1, 2]:.1f} px, distortion {coefficients}"
-    )
-
-
-def _when(rows: BoolArray, seconds: np.ndarray) -> str:
-    """Return the times of views as a sentence: at most three stretches, the longest ones."""
-    marks = np.flatnonzero(np.diff(np.concatenate([[False], rows, [False]]).astype(int)))
-    parts = sorted(zip(marks[::2], marks[1::2] - 1, strict=True), key=lambda p: p[0] - p[1])[:3]
-    return "from " + ", ".join(f"{seconds[a]:.1f} to {seconds[b]:.1f} s" for a, b in sorted(parts))
+        return f"{best} (estimated)"
+    why = "" if fit.possible else f", longer than {1e3 * fit.interval:.1f} ms between images"
+    return f"invisible in these images (best fit {best}{why})"

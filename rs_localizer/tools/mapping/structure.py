@@ -60,7 +60,6 @@ class Structure:
     descriptors: NDArray[np.float32]  # (p,128)
     camera: Camera  # lens as given, or as COLMAP calibrated it; without a readout time
     parts: tuple[int, ...]  # views of each part that hangs together, the largest first: this one
-    error: float  # px, mean reprojection error of COLMAP's model
 
 
 def require() -> None:
@@ -117,7 +116,6 @@ def build_structure(
         descriptors=model.descriptors.astype(np.float32),
         camera=lens or model.camera,
         parts=tuple(said["parts"]),
-        error=said["error"],
     )
 
 

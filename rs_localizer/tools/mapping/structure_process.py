@@ -47,7 +47,6 @@ def main(task: dict[str, Any]) -> None:
     if ordered:
         (folder / SPARSE).mkdir()
         ordered[0].write(folder / SPARSE)
-        result["error"] = ordered[0].compute_mean_reprojection_error()
     with closing(sqlite3.connect(database)) as tables:
         # Readers of a database with a write-ahead log leave files beside it.
         tables.execute("PRAGMA journal_mode=DELETE")

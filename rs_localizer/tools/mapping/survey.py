@@ -39,13 +39,13 @@ from rs_localizer.tools.adjust.variables import (
     start_state,
 )
 from rs_localizer.tools.mapping.gauge import of_the_shape, through
-from rs_localizer.tools.mapping.initial_trajectory import (
+from rs_localizer.tools.mapping.map_keypoints import (
     ANGULAR_VELOCITY,
     LINEAR_VELOCITY,
+    Adjusted,
     acceleration_prior,
     initial_trajectory,
 )
-from rs_localizer.tools.mapping.map_keypoints import Adjusted
 from rs_localizer.tools.mapping.unknown_markers import Chained, Filmed, chain
 from rs_localizer.tools.readout_belief import ReadoutCheck, disagreement
 

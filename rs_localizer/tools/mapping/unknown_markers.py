@@ -165,35 +165,29 @@ def chain(filmed: Filmed, markers: Sequence[Marker], origin: int | None) -> Chai
 
 
 def _sights(camera: Camera, image: Spotted, markers: Sequence[Marker]) -> list[_MarkerSight]:
-    sights = []
+    """Return the markers of an image with the poses camera_from_marker that fit."""
+    sights, doubt = [], _SHUTTER / camera.focal_length
     for marker, quad in zip(image.markers.tolist(), image.quads, strict=True):
-        rays = camera.rays(quad)
-        if np.isfinite(rays).all():
-            poses = _square_poses(markers[marker].corners, rays, _SHUTTER / camera.focal_length)
-            if poses:
-                sights.append(_MarkerSight(marker, rays, poses))
+        rays, corners = np.ascontiguousarray(camera.rays(quad)), markers[marker].corners
+        if not np.isfinite(rays).all():
+            continue
+        try:
+            _, turns, places, errors = cv2.solvePnPGeneric(
+                corners, rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
+            )
+        except cv2.error:
+            continue
+        rotations = Rotation.from_rotvec(np.reshape(turns, (-1, 3))).as_matrix()
+        centres = np.reshape(places, (-1, 3)).astype(np.float64)
+        fits = np.exp(-(np.ravel(errors) - np.min(errors)) / doubt).tolist()
+        poses = [
+            (Transform(rotation, centre), fit)
+            for rotation, centre, fit in zip(rotations, centres, fits, strict=True)
+            if centre[2] > 0.0
+        ]
+        if poses:
+            sights.append(_MarkerSight(marker, rays, poses))
     return sights
-
-
-def _square_poses(corners: Array, rays: Array, doubt: float) -> list[tuple[Transform, float]]:
-    """Return poses camera_from_marker that fit rays (4,2), and their weights, of 1."""
-    try:
-        _, turns, places, errors = cv2.solvePnPGeneric(
-            corners, np.ascontiguousarray(rays), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
-        )
-    except cv2.error:
-        return []
-    fits = np.exp(-(np.ravel(errors) - np.min(errors)) / doubt)
-    return [
-        (Transform(Rotation.from_rotvec(turn).as_matrix(), place), fit)
-        for turn, place, fit in zip(
-            np.reshape(turns, (-1, 3)),
-            np.reshape(places, (-1, 3)).astype(float),
-            fits.tolist(),
-            strict=True,
-        )
-        if place[2] > 0.0
-    ]
 
 
 def _between(

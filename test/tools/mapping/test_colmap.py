@@ -15,7 +15,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.camera_files import colmap_camera, colmap_parameters
 from rs_localizer.tools.mapping import MappingError
 from rs_localizer.tools.mapping import structure as structures
-from rs_localizer.tools.mapping.shutter_fit import global_errors
+from rs_localizer.tools.mapping.refinement import global_errors
 from rs_localizer.tools.mapping.structure import build_structure, image_name, pairs_of
 from rs_localizer.tools.simulation.walls import collage
 
@@ -111,7 +111,6 @@ def test_a_plane_and_a_box_are_mapped_without_a_calibration(tmp_path):
     structure = build(images, tmp_path / "out", count)
     assert structure.parts == (count,)
     assert structure.camera.K[0, 0] == pytest.approx(focal, rel=0.03)
-    assert structure.error < 0.7
     assert structure.descriptors.shape == (len(structure.start.points), 128)
     # Positions have the true shape.
     true, found = np.array(centres), structure.start.positions
@@ -120,4 +119,4 @@ def test_a_plane_and_a_box_are_mapped_without_a_calibration(tmp_path):
     assert np.ptp(ratios) < 0.05 * np.median(ratios)
     # Observations are where the points project to.
     errors = global_errors(structure.camera, structure.seen, structure.start)
-    assert np.mean(errors) == pytest.approx(structure.error, rel=0.05)
+    assert np.mean(errors) < 0.7

@@ -10,8 +10,7 @@ from scenes import READOUT, camera, walk
 
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.tools.mapping.map_keypoints import MapFreedom
-from rs_localizer.tools.mapping.refinement import RefinedMap
-from rs_localizer.tools.mapping.shutter_fit import fit_shutter
+from rs_localizer.tools.mapping.refinement import RefinedMap, fit_shutter
 from rs_localizer.tools.readout_belief import ShutterFit
 
 VIDEO = np.arange(0.0, 1.2, 1.0 / 30.0)
@@ -28,8 +27,6 @@ def test_a_rolling_shutter_is_found():
     assert shutter.direction == ScanDirection.TOP_TO_BOTTOM
     assert refined.readout_time == pytest.approx(READOUT, abs=4.0 * shutter.deviation)
     assert shutter.deviation < 1e-3
-    assert shutter.noise < 0.7 * shutter.global_noise
-    assert shutter.better_images > 0.9
 
 
 def test_a_global_shutter_is_left_alone():
