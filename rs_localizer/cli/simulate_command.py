@@ -40,14 +40,15 @@ if WORKING:
     from rs_localizer.tools.simulation.simulated_frames import (
         SimulatedFrame,
         frame_stamps,
+        middle_stamp,
         simulate_frames,
     )
     from rs_localizer.tools.simulation.simulated_imu import (
-        ImuBagWriter,
         ImuSettings,
         Lever,
         shaken,
         simulate_imu,
+        write_imu,
     )
     from rs_localizer.tools.simulation.simulated_recording import (
         camera_stamps,
@@ -275,21 +276,20 @@ class _Recorder:
 
     def _write_camera(self, folder: Path) -> dict[str, Any]:
         args, camera, stamps = self._args, self._camera, self.stamps
-        with self._bag(folder) as bag:
+        # As from a real camera: recorded when the last row has been read.
+        later_ns = round(camera.readout_time * 1e9) if args.imu else 0
+        with BagWriter(folder) as bag:
+            if args.imu:
+                lever, imu = Lever(), ImuSettings(time_offset=args.imu_offset)
+                rng = np.random.default_rng([args.seed, _IMU_STREAM])
+                track = simulate_imu(self._motion, imu, lever, rng)
+                last_ns = middle_stamp(camera, stamps[-1]) + later_ns
+                write_imu(bag, track, imu, lever, stamps[0], last_ns)
             frames = _see(args, self.world, camera, self._motion, stamps)
             for frame in tqdm(frames, "simulate", len(stamps), unit="frame", disable=None):
-                write_simulated(bag, camera, frame, self._keypoints(frame))
+                write_simulated(bag, camera, frame, self._keypoints(frame), later_ns)
         direction = str(camera.scan_direction)
         return {"readout_time": camera.readout_time, "scan_direction": direction}
-
-    def _bag(self, folder: Path) -> BagWriter:
-        args = self._args
-        if not args.imu:
-            return BagWriter(folder)
-        lever, imu = Lever(), ImuSettings(time_offset=args.imu_offset)
-        rng = np.random.default_rng([args.seed, _IMU_STREAM])
-        track = simulate_imu(self._motion, imu, lever, rng)
-        return ImuBagWriter(folder, self._camera.readout_time, track, imu, lever)
 
     def _write_rig(self, folder: Path) -> dict[str, Any]:
         parts, motion = self._parts, self._motion

@@ -57,14 +57,16 @@ class SimulatedFrame:
         )
 
 
-def frame_stamps(motion: TrueMotion, camera: Camera, rate: float) -> list[int]:
+def frame_stamps(motion: TrueMotion, camera: Camera, rate: float, phase_ns: int = 0) -> list[int]:
     """Return times (ns) of all frames whose readout lies within a stretch of the motion.
+
+    The first one is ``phase_ns`` after the motion's start.
 
     The camera runs on through the gaps of a recorded motion, but what it saw there is unknown:
     these frames are left out.
     """
     intervals, readout_ns = motion.intervals_ns, round(camera.readout_time * 1e9)
-    start, end = intervals[0][0], intervals[-1][1]
+    start, end = intervals[0][0] + phase_ns, intervals[-1][1]
     stamps = [start + round(k * 1e9 / rate) for k in range(int((end - start) * 1e-9 * rate) + 1)]
     seen = [(first, last - readout_ns) for first, last in intervals]
     return [stamp for stamp in stamps if any(first <= stamp <= last for first, last in seen)]

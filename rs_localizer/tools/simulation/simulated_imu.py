@@ -10,7 +10,6 @@ of it is made of what the estimators assume.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from rs_localizer.io import topics
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.imu import make_reading
 from rs_localizer.io.recording import CAMERA_FRAME
+from rs_localizer.io.topics import TF_STATIC
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.tools.simulation.simulated_settings import BODY_FROM_CAMERA
 from rs_localizer.tools.simulation.true_motion import TrueMotion, TrueState
@@ -172,63 +172,26 @@ def _direction(rng: np.random.Generator) -> Array:
 
 IMU_TOPIC = f"/{topics.IMU}"
 IMU_FRAME = "imu_link"
-# Readings go on for so long after the last frame.
-_REST_NS = 100_000_000
-_BEFORE_NS = 700_000_000
+# Readings begin and end so long before the first frame and after the last one.
+_BEFORE_NS, _REST_NS = 700_000_000, 100_000_000
 
 
-class ImuBagWriter(BagWriter):
-    """Writes a recording of a camera and an IMU.
-
-    What is written with the stamp of a frame is recorded when its last row has been read, as from a
-    real camera; between the frames come the readings, recorded when they were taken.
+def write_imu(
+    bag: BagWriter, track: ImuTrack, settings: ImuSettings, lever: Lever, first_ns: int,
+    last_ns: int,
+) -> None:  # fmt: skip
+    """Write the mounting of an IMU, and its readings, recorded when they were taken.
 
     Args:
-        path: as for :class:`BagWriter`.
-        readout_time: s.
-        track, settings, lever: of the IMU.
+        first_ns: stamp of the first frame.
+        last_ns: when the last one is recorded.
     """
-
-    def __init__(
-        self,
-        path: Path,
-        readout_time: float,
-        track: ImuTrack,
-        settings: ImuSettings,
-        lever: Lever,
-    ) -> None:
-        super().__init__(path)
-        self._delay_ns = round(readout_time * 1e9)
-        self._track, self._settings, self._lever = track, settings, lever
-        self._next: int | None = None  # reading to be written
-
-    def write(self, topic: str, message: Any, stamp_ns: int) -> None:
-        recorded_ns = stamp_ns + self._delay_ns
-        if self._next is None:
-            begin_ns = stamp_ns - _BEFORE_NS
-            self._next = int(np.searchsorted(self._track.times_ns, begin_ns))
-            super().write("/tf_static", mounting(self._lever), begin_ns)
-        self._write_readings(recorded_ns)
-        self._latest_ns = recorded_ns
-        super().write(topic, message, recorded_ns)
-
-    def __exit__(self, *failure: Any) -> None:
-        if failure[0] is None and self._next is not None:
-            self._write_readings(self._latest_ns + _REST_NS)
-        super().__exit__(*failure)
-
-    def _write_readings(self, until_ns: int) -> None:
-        assert self._next is not None
-        end = int(np.searchsorted(self._track.times_ns, until_ns, "right"))
-        for i in range(self._next, end):
-            message = make_imu(
-                int(self._track.stamps_ns[i]),
-                self._track.angular_velocities[i],
-                self._track.specific_forces[i],
-                self._settings,
-            )
-            super().write(IMU_TOPIC, message, int(self._track.times_ns[i]))
-        self._next = max(self._next, end)
+    begin_ns, end_ns = first_ns - _BEFORE_NS, last_ns + _REST_NS
+    bag.write(TF_STATIC, mounting(lever), begin_ns)
+    for i in np.flatnonzero((track.times_ns >= begin_ns) & (track.times_ns <= end_ns)).tolist():
+        stamp, rate = int(track.stamps_ns[i]), track.angular_velocities[i]
+        message = make_imu(stamp, rate, track.specific_forces[i], settings)
+        bag.write(IMU_TOPIC, message, int(track.times_ns[i]))
 
 
 def make_imu(

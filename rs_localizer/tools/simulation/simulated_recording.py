@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -85,13 +84,19 @@ def write_simulated(
     camera: Camera,
     frame: SimulatedFrame | RenderedFrame,
     keypoints: NDArray[Any] | None = None,
+    later_ns: int = 0,
 ) -> None:
-    """Write what a camera sees, and the truth at first and middle row."""
-    for topic, message in view_messages(camera, frame, frame.stamp_ns, keypoints).items():
-        bag.write(topic, message, frame.stamp_ns)
-    write_truth(bag, frame.stamp_ns, frame.first_row)
-    if frame.middle_ns != frame.stamp_ns:
-        write_truth(bag, frame.middle_ns, frame.middle_row)
+    """Write what a camera sees, and the truth at first and middle row.
+
+    Args:
+        later_ns: from the time of a message to when it is recorded.
+    """
+    stamp_ns, middle_ns = frame.stamp_ns, frame.middle_ns
+    for topic, message in view_messages(camera, frame, stamp_ns, keypoints).items():
+        bag.write(topic, message, stamp_ns + later_ns)
+    write_truth(bag, stamp_ns, frame.first_row, recorded_ns=stamp_ns + later_ns)
+    if middle_ns != stamp_ns:
+        write_truth(bag, middle_ns, frame.middle_row, recorded_ns=middle_ns + later_ns)
 
 
 def view_messages(
@@ -217,38 +222,26 @@ def camera_stamps(
     for place, (name, camera) in enumerate(parts.cameras.items()):
         rng = np.random.default_rng([seed, _CLOCK_STREAM, place])
         phase, error = rng.uniform(0.0, 1.0 / rate), rng.normal(0.0, _RATE_ERROR)
-        steady = np.array(frame_stamps(motion, camera, rate * (1.0 + error)), np.int64)
-        shifted = steady + round(phase * 1e9)
-        lasts_ns = round(camera.readout_time * 1e9)
-        stamps[name] = [
-            int(stamp)
-            for stamp in shifted
-            if any(first <= stamp <= last - lasts_ns for first, last in motion.intervals_ns)
-        ]
+        own = rate * (1.0 + error)
+        stamps[name] = frame_stamps(motion, camera, own, round(phase * 1e9))
     return stamps
 
 
 def simulate_rig(
     parts: RigParts, motion: TrueMotion, see: Callable[[str, TrueMotion, int], Iterable[Frame]]
 ) -> Iterator[RigFrame]:
-    """Return the frames of all cameras, in the order in which they have been read.
+    """Yield the frames of one camera after the other; readers of a bag order them by time.
 
     Args:
         parts: the rig; its stamps are those of true time without ``time_offset``.
         motion: of the rig's axes.
         see: the frames of a camera by its name, its motion, and its place among the random numbers.
     """
-
-    def images(place: int, name: str, camera: Camera) -> Iterator[tuple[int, int, RigFrame]]:
+    for place, name in enumerate(parts.cameras):
         mounted = MountedMotion(motion, *parts.camera_from_rig[name])
         offset_ns = round(parts.time_offset.get(name, 0.0) * 1e9)
         for frame in see(name, mounted, 1000 * place):
-            read_ns = frame.stamp_ns + round(camera.readout_time * 1e9)
-            yield read_ns, place, RigFrame(name, frame.stamp_ns - offset_ns, frame)
-
-    streams = [images(place, *item) for place, item in enumerate(parts.cameras.items())]
-    for _, _, image in heapq.merge(*streams, key=lambda item: item[:2]):
-        yield image
+            yield RigFrame(name, frame.stamp_ns - offset_ns, frame)
 
 
 def rig_parameters(parts: RigParts) -> dict[str, Any]:
