@@ -15,6 +15,7 @@ share of all information that comes from it: what was estimated fits its own err
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -63,15 +64,15 @@ def cluster_robust(problem: Problem, fitted: Fit) -> Fit:
 
 def _pull(problem: Problem, fitted: Fit) -> Pull:
     """Return pulls in units in which the border has covariance 1, and the controls follow it."""
-    factored = fitted.factored
-    covariance = factored.border_covariance()
-    unit = np.zeros((problem.groups.kept, problem.border))
-    unit[problem.groups.motion :] = np.eye(problem.border)
-    following = factored.kept(unit) @ np.linalg.inv(np.linalg.cholesky(covariance)).T
+    covariance = fitted.factored.border_covariance()
+    unit = np.eye(problem.groups.kept, problem.border, -problem.groups.motion)
+    following = fitted.factored.kept(unit) @ np.linalg.inv(np.linalg.cholesky(covariance)).T
     total, expected = 0.0, 0.0
     every = problem.keypoint_rows(fitted.state, fitted.deviation)
     for rows, view in zip(every, problem.views, strict=True):
-        for first, end in _seconds(view.observations.times):
+        seconds = np.floor(view.observations.times / SECONDS)  # they rise
+        starts = np.flatnonzero(np.diff(seconds, prepend=-np.inf)).tolist()
+        for first, end in pairwise([*starts, len(seconds)]):
             own = rows.matrix(slice(first, end), len(following)) @ following
             total += float(np.sum((own.T @ rows.errors[first:end].ravel()) ** 2))
             share = own.T @ own if own.shape[0] > own.shape[1] else own @ own.T
@@ -92,14 +93,11 @@ def by_seconds(problem: Problem, fitted: Fit, number: int) -> tuple[Array, Array
         and the deviations of these steps (s,), both in those of the number for noise of 1.
     """
     at = problem.groups.motion + number
-    unit = np.zeros((problem.groups.kept, 1))
-    unit[at] = 1.0
-    following = fitted.factored.kept(unit)
+    following = fitted.factored.kept(np.eye(problem.groups.kept, 1, -at))
     following /= np.sqrt(following[at])
     every = problem.keypoint_rows(fitted.state, fitted.deviation)
-    parts = [rows.matrix(slice(None), len(following)) @ following for rows in every]
-    own = np.concatenate(parts).reshape(-1, 2)
-    errors = np.concatenate([rows.errors for rows in every])
+    own = np.concatenate([rows.matrix(slice(None), len(following)) @ following for rows in every])
+    own, errors = own.reshape(-1, 2), np.concatenate([rows.errors for rows in every])
     times = np.concatenate([view.observations.times for view in problem.views])
     second = np.unique(np.floor(times / SECONDS), return_inverse=True)[1]
     pulls, shares = (np.bincount(second, np.sum(own * of, axis=1)) for of in (errors, own))
@@ -107,12 +105,6 @@ def by_seconds(problem: Problem, fitted: Fit, number: int) -> tuple[Array, Array
     of_errors = steepness(fitted.squared_errors[fitted.inliers], fitted.deviation)
     steps = -of_errors * pulls[told] / shares[told]
     return steps, np.sqrt(fitted.inflation / shares[told])
-
-
-def _seconds(times: Array) -> list[tuple[int, int]]:
-    """Return the first and end of the keypoints of each second, at rising times (n,)."""
-    starts = np.flatnonzero(np.diff(np.floor(times / SECONDS), prepend=-np.inf))
-    return list(zip(starts.tolist(), [*starts[1:].tolist(), len(times)], strict=True))
 
 
 def pull_at_landmarks(rows: Array, landmarks: IntArray, times: Array, held: Array) -> Pull:

@@ -298,9 +298,7 @@ class Factored:
         groups = self.system.groups
         if not self.system.dense:
             return self._solve_schur(np.eye(groups.border))
-        unit = np.zeros((groups.kept, groups.border))
-        unit[groups.motion :] = np.eye(groups.border)
-        return self.kept(unit)[groups.motion :]
+        return self.kept(np.eye(groups.kept, groups.border, -groups.motion))[groups.motion :]
 
     def block_covariances(self) -> tuple[Array, Array]:
         """Return covariances of blocks (b,w,w) and border (b,b); uses up a dense factor."""
