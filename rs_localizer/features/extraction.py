@@ -120,10 +120,6 @@ _ORB_LEVELS, _ORB_STEP = 8, 1.2
 _AKAZE_THRESHOLD = 0.00025
 
 
-class FeatureError(ValueError):
-    """A method that this OpenCV does not have; the text says what to do."""
-
-
 @dataclass(frozen=True, slots=True)
 class _Method:
     """One way to find keypoints and to describe them.
@@ -168,7 +164,7 @@ def _akaze(_: int) -> Any:
     for module in (cv2, getattr(cv2, "xfeatures2d", None)):
         if (akaze := getattr(module, "AKAZE", None)) is not None:
             return akaze.create(threshold=_AKAZE_THRESHOLD)
-    raise FeatureError(
+    raise ValueError(
         f"OpenCV {cv2.__version__} has no AKAZE: take sift or orb, or install "
         f'"opencv-python-headless<5" or opencv-contrib-python-headless'
     )
@@ -257,12 +253,12 @@ class FeatureExtractor:
         most: keypoints of an image.
 
     Raises:
-        FeatureError: for another kind, or one that this OpenCV does not have.
+        ValueError: for another kind, or one that this OpenCV does not have.
     """
 
     def __init__(self, kind: str, most: int) -> None:
         if kind not in _METHODS:
-            raise FeatureError(f"features must be one of {', '.join(_METHODS)}; got {kind!r}")
+            raise ValueError(f"features must be one of {', '.join(_METHODS)}; got {kind!r}")
         self._method = _METHODS[kind]
         self._is_sift = kind == FeatureKind.SIFT
         self._most = most

@@ -14,10 +14,6 @@ _SAME_RATE = 0.02
 _OTHER_RATE = 1.5
 
 
-class TimesError(ValueError):
-    """A file without times; the message says what to give instead."""
-
-
 @dataclass(slots=True)
 class ImageClock:
     """Stamps of the images of a video or a folder, one after the other.
@@ -52,7 +48,7 @@ class ImageClock:
         """Return the stamp of the next image by its own time; None if unknown.
 
         Raises:
-            TimesError: when the file has no times and no rate was given.
+            ValueError: when the file has no times and no rate was given.
         """
         index = self._images
         self._images += 1
@@ -64,7 +60,7 @@ class ImageClock:
         if self.rate is not None:
             return self._start_ns + round(index * 1e9 / self.rate)
         if own_ns is None and index <= 1:  # the first is at 0 in a file without times, too
-            raise TimesError("the images have no times of their own: give --rate")
+            raise ValueError("the images have no times of their own: give --rate")
         return None if own_ns is None else self._zero_ns + own_ns
 
     @property

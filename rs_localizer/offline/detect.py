@@ -44,10 +44,6 @@ _MOST_STILL, _STILL_PERCENT = 1.5, 10.0
 _MISFITS = 3
 
 
-class DetectError(ValueError):
-    """Images without a use; the message says what was found."""
-
-
 @dataclass(slots=True)
 class ImageTally:
     """Counts of used and refused images."""
@@ -100,7 +96,7 @@ def record_markers(
         tell: called if many images at the beginning show nothing, with what they show instead.
 
     Raises:
-        DetectError: when no image shows anything, or images and calibration differ in size.
+        ValueError: when no image shows anything, or images and calibration differ in size.
     """
     found = Extraction()
     tally = _MarkerTally(detector, found)
@@ -118,7 +114,7 @@ def record_markers(
             tell(f"{count} of the first {_PATIENCE} images {tally.nothing()}")
     if not found.counts:
         of = f" of {options.camera}" if options.camera else ""
-        raise DetectError(f"none of the {found.images} images{of} {tally.nothing()}")
+        raise ValueError(f"none of the {found.images} images{of} {tally.nothing()}")
     return tally.recorded()
 
 
@@ -143,7 +139,7 @@ def usable(
         done: called after each of them.
 
     Raises:
-        DetectError: when they and their calibration differ in size, or, without one, they are of
+        ValueError: when they and their calibration differ in size, or, without one, they are of
             several sizes.
     """
     cameras, size = Cameras(scan_direction), None
@@ -163,7 +159,7 @@ def usable(
             size = size or image.pixels.shape
             if camera is None and image.pixels.shape != size:
                 (height, width), (other, across) = size, image.pixels.shape
-                raise DetectError(
+                raise ValueError(
                     f"the image at {1e-9 * image.stamp_ns:.3f} s is of {across}x{other}, those "
                     f"before it are of {width}x{height}: a lens is calibrated with images of one "
                     "size"
@@ -243,7 +239,7 @@ class Cameras:
         """Return the camera of one image, or refuse it if its size is another one.
 
         Raises:
-            DetectError: when its camera_info cannot be used, or the first images are all of
+            ValueError: when its camera_info cannot be used, or the first images are all of
                 another size.
         """
         try:
@@ -251,7 +247,7 @@ class Cameras:
             if self._last is None or self._last[0] != calibration:
                 self._last = calibration, calibration.camera(0.0, self._scan_direction)
         except MessageError as error:
-            raise DetectError(f"the camera_info cannot be used: {error}") from error
+            raise ValueError(f"the camera_info cannot be used: {error}") from error
         camera = self._last[1]
         height, width = image.pixels.shape
         if (width, height) != camera.size:
@@ -271,9 +267,9 @@ class Cameras:
         return camera
 
     def check(self) -> None:
-        """Raise DetectError if no image so far was of the size of its calibration."""
+        """Raise ValueError if no image so far was of the size of its calibration."""
         if self._misfit and not self._fit:
-            raise DetectError(self._fault)
+            raise ValueError(self._fault)
 
 
 def _why(size: tuple[int, int], calibrated: tuple[int, int]) -> str:
@@ -323,7 +319,7 @@ def record_features(
     """Write the keypoints of all images that have any, each with its CameraInfo.
 
     Raises:
-        DetectError: when no image has keypoints, or images and calibration differ in size.
+        ValueError: when no image has keypoints, or images and calibration differ in size.
     """
     extraction = Extraction()
     kept = _kept(shots, bag, extraction)
@@ -334,5 +330,5 @@ def record_features(
             _write(bag, shot, KEYPOINTS_TOPIC, keypoints(extracted, make_message), options)
     if not extraction.counts:
         reasons = "".join(f"; {detail}" for detail in extraction.refused.values())
-        raise DetectError(f"none of the {extraction.images} images has any keypoint{reasons}")
+        raise ValueError(f"none of the {extraction.images} images has any keypoint{reasons}")
     return extraction

@@ -35,10 +35,6 @@ _EARLIEST_NS, _LATEST_NS = 10**17, 2**31 * 10**9
 _SHORTEST_NS, _LONGEST_NS = 10**6, 2 * 10**9
 
 
-class SourceError(ValueError):
-    """Images that cannot be used; the message says what was found."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Shot:
     """One image of a source, and the camera that took it."""
@@ -95,12 +91,12 @@ def image_files(folder: Path) -> list[Path]:
     """Return the image files of a folder by name, or by number if the names are numbers.
 
     Raises:
-        SourceError: when there is none.
+        ValueError: when there is none.
     """
     every = [file for file in folder.iterdir() if file.is_file()]  # /dev/zero has no end
     files = [file for file in every if file.suffix.lower() in _FORMATS]
     if not files:
-        raise SourceError(
+        raise ValueError(
             f"{folder} has no images: no file ends in {', '.join(_FORMATS)}; convert others to PNG "
             "without turning or scaling them"
         )
@@ -164,7 +160,7 @@ def from_bag(
         topics.append(info_topic)
         latest = next((message for _, _, message in bag.messages([info_topic])), None)
         if latest is None:
-            raise SourceError(f"{bag.path} has no message on {info_topic}; give --calibration")
+            raise ValueError(f"{bag.path} has no message on {info_topic}; give --calibration")
     for topic, recorded_ns, message in bag.messages(topics):
         if topic == info_topic:
             latest = message

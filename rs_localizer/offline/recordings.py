@@ -22,10 +22,6 @@ from rs_localizer.offline.replay import TF_TYPE, Topics, as_tf2, imu_topics, tf_
 from rs_localizer.pipeline.inputs import CAMERA_INFO_TYPE, IMAGE_TYPES, IMU_TYPE
 
 
-class RecordingError(ValueError):
-    """A recording without a use; the message says what was found."""
-
-
 @dataclass(frozen=True, slots=True)
 class Recorded:
     """Correspondences of a recording with a map."""
@@ -44,7 +40,7 @@ def read_recording(bag: BagReader, topics: Topics, landmarks: Map | None = None)
     The last usable camera_info gives the camera.
 
     Raises:
-        RecordingError: without correspondences or camera_info, or with several cameras.
+        ValueError: without correspondences or camera_info, or with several cameras.
     """
     matcher = None if landmarks is None else Matcher(landmarks)
     clouds: list[Correspondences] = []
@@ -58,7 +54,7 @@ def read_recording(bag: BagReader, topics: Topics, landmarks: Map | None = None)
                 read = read_camera_info(message)
                 read.camera(0.0, ScanDirection.TOP_TO_BOTTOM)  # refuses what is not calibrated
                 if calibration is not None and read != calibration:
-                    raise RecordingError(
+                    raise ValueError(
                         f"{bag.path}: camera_info changes within the recording; cut it there"
                     )
                 calibration = read
@@ -73,10 +69,10 @@ def read_recording(bag: BagReader, topics: Topics, landmarks: Map | None = None)
         except (MessageError, MatchError) as error:
             faults.update((str(error),))
     if calibration is None:
-        raise RecordingError(f"{bag.path} has no usable camera_info")
+        raise ValueError(f"{bag.path} has no usable camera_info")
     if not clouds:
         why = f"; {faults.most_common(1)[0][0]}" if faults else ""
-        raise RecordingError(f"{bag.path} has no usable correspondences{why}")
+        raise ValueError(f"{bag.path} has no usable correspondences{why}")
     return Recorded(calibration, tuple(clouds))
 
 
@@ -89,7 +85,7 @@ def read_imu_recording(bag: BagReader, topic: str | None, camera_frame: str) -> 
 
     Raises:
         BagError: when the topic is not there, or several could be meant.
-        RecordingError: when none of its messages can be used, with the reason.
+        ValueError: when none of its messages can be used, with the reason.
     """
     if topic is None and len(found := imu_topics(bag)) == 1:
         topic = found[0]
@@ -105,7 +101,7 @@ def read_imu_recording(bag: BagReader, topic: str | None, camera_frame: str) -> 
         stamps.append(reading.stamp_ns)
         rates.append(reading.angular_velocity)
     if not stamps:
-        raise RecordingError(f"{bag.path} has no usable message on {topic}{fault}")
+        raise ValueError(f"{bag.path} has no usable message on {topic}{fault}")
     hung = transform_between(bag, camera_frame, frame)
     return ImuRecording(
         np.array(stamps, np.int64),

@@ -45,7 +45,7 @@ class FrameExtractor:
         config: its settings.
 
     Raises:
-        FeatureError: for features that this OpenCV does not have.
+        ValueError: for features that this OpenCV does not have.
     """
 
     def __init__(self, config: FeatureConfig) -> None:

@@ -29,10 +29,6 @@ _AGAIN, _TOO_LONG = 5.0, 60.0
 _SETTLING = 1.0  # s for endpoints to find each other both ways
 
 
-class LiveError(ValueError):
-    """A node that does not start or does not answer."""
-
-
 class LiveNode:
     """A localizer and a peer that sends to it; a context manager.
 
@@ -72,7 +68,7 @@ class LiveNode:
             self._executor.add_node(each)
         for trigger in (self._node.trigger_configure, self._node.trigger_activate):
             if trigger() != TransitionCallbackReturn.SUCCESS:
-                raise LiveError("the node does not start: see its log")
+                raise ValueError("the node does not start: see its log")
         ends = [each.get_subscription_count for each in self._publishers]
         ends.append(lambda: peer.count_publishers(heard.topic_name))
         self._until(lambda: all(count() for count in ends))
@@ -87,7 +83,7 @@ class LiveNode:
         """Return the node's answer to a frame; None if the node has refused it.
 
         Raises:
-            LiveError: when there is none.
+            ValueError: when there is none.
         """
         stamp, before, sent = stamp_ns(cloud), self._unanswered, float("-inf")
 
@@ -116,4 +112,4 @@ class LiveNode:
         while not condition():
             self._executor.spin_once(timeout_sec=0.05)
             if time.monotonic() > end:
-                raise LiveError(f"the node has not answered for {_TOO_LONG:.0f} s: see its log")
+                raise ValueError(f"the node has not answered for {_TOO_LONG:.0f} s: see its log")

@@ -8,7 +8,7 @@ import pytest
 
 from rs_localizer.cli.commands import main
 from rs_localizer.io.bags import BagWriter, make_message
-from rs_localizer.offline.image_sources import SourceError, image_files, name_times
+from rs_localizer.offline.image_sources import image_files, name_times
 
 EVERY_33_MS = [0, 33_366_000, 66_733_000]
 
@@ -44,5 +44,5 @@ def test_what_has_no_images_is_named(tmp_path, capsys):
     assert main(["detect", str(path), "--board", "9x6", "--square", "0.03", "--out", "x"]) == 1
     assert "it has /eye/theora (std_msgs/msg/String)" in capsys.readouterr().err
     (tmp_path / "IMG_0001.heic").touch()
-    with pytest.raises(SourceError, match=r"no file ends in \.jpg, .*convert others to PNG"):
+    with pytest.raises(ValueError, match=r"no file ends in \.jpg, .*convert others to PNG"):
         image_files(tmp_path)
