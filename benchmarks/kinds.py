@@ -337,7 +337,7 @@ def judged(kind: Kind, seed: int, count: int = _RECORDINGS, length: int = _LENGT
     rng = np.random.default_rng([seed, *kind.name.encode()])
     motions, camera = kind.motion(count, rng), kind.camera
     tally, scene = _Tally(), kind.scene(rng)
-    times = 1e-9 * PERIOD_NS * (np.arange(length) - length // 2)
+    times = 1e-9 * PERIOD_NS * (np.arange(length, dtype=np.float64) - length // 2)
     for k in range(count):
         here = np.full(length, k)
         # Every recording has its own map: the scene stands before its first pose.
