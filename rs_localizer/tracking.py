@@ -212,10 +212,10 @@ class Tracker:
     def _trusts_motion(self, context: FrameContext) -> bool:
         """Return whether motion between frames predicts the motion within one."""
         least = min(camera.readout_time for camera in self.localizer.rig.cameras.values())
-        known = self.readout_time_deviation(context) < FAR_OFF * least
+        known = self._readout_time_deviation(context) < FAR_OFF * least
         return self.remembers_motion and self.shutter.trusted and known
 
-    def readout_time_deviation(self, context: FrameContext) -> float:
+    def _readout_time_deviation(self, context: FrameContext) -> float:
         """Return the standard deviation (s) of the readout time, as given or as frames show it."""
         return max(context.readout_time_deviation, self.shutter.error)
 
@@ -278,7 +278,7 @@ class Tracker:
             given = self._given
             return given[1] if given is not None and given[0] == time_ns else None
         own = track.estimate.span
-        share = self.readout_time_deviation(context) / own
+        share = self._readout_time_deviation(context) / own
         window = replace(track.window, readout_share=share)
         motion, covariance = window.after(time_ns).per_readout(own if span is None else span)
         return predicted(motion, covariance + track.swing)
@@ -659,7 +659,7 @@ class Tracker:
         self, time_ns: int, told: MotionSample | None, result: Estimate, context: FrameContext
     ) -> MotionWindow:
         """Return a window of the last frames and this one; if it denies them, of this one alone."""
-        track, share = self._track, self.readout_time_deviation(context) / result.span
+        track, share = self._track, self._readout_time_deviation(context) / result.span
         if track is not None and told is not None and self._trusts_motion(context):
             window = replace(track.window, readout_share=share).joined(told)
             if window.surprise < _MOST_INNOVATION:  # NaN, of rounding errors, is not

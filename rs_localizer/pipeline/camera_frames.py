@@ -247,8 +247,7 @@ class CameraFrames(FrameLocalizer):
             self._notice(Notice.DOUBTFUL, result.left_out)
         if self._tracker.lens.fault:
             self._notice(Notice.LENS, self._tracker.lens.fault)
-        deviation = self._tracker.readout_time_deviation(self._context)
-        return self._result(cloud, result, moment, deviation)
+        return self._result(cloud, result, moment, self._config.readout_time_deviation)
 
     def _delayed(self, newest: Localized | Refusal, stamp_ns: int) -> Localized | Refusal | None:
         """Return the result that ``output_lag`` asks for, once the frame of this stamp has come.
@@ -299,5 +298,5 @@ class CameraFrames(FrameLocalizer):
         if found is None:
             return None
         cloud = replace(self._newest, stamp_ns=stamp_ns)
-        deviation = self._tracker.readout_time_deviation(self._context)
-        return self._result(cloud, found, PublishedMoment(stamp_ns, 0.0), deviation)
+        moment = PublishedMoment(stamp_ns, 0.0)
+        return self._result(cloud, found, moment, self._config.readout_time_deviation)

@@ -234,7 +234,7 @@ class FrameLocalizer(ABC):
             cloud: with the rows of the estimate, or with none.
             estimate: of the first camera.
             moment: for which they are valid.
-            deviation: s, of the readout time.
+            deviation: s, of the readout time as it is given.
         """
         pose, twist = published_motion(
             estimate, moment, self._config, next(iter(self._cameras.values())), deviation,
