@@ -242,6 +242,7 @@ def kinds() -> list[Kind]:
         Kind("half map moved 1 cm, corner", _corner, partial(part_moved, 0.5, 0.01)),
         Kind("half map moved 3 cm, room", _room, partial(part_moved, 0.5, 0.03)),
         Kind("half map moved 10 cm, room", _room, partial(part_moved, 0.5, 0.1)),
+        Kind("half map moved 50 cm, room", _room, partial(part_moved, 0.5, 0.5)),
         Kind("third moved 1 cm, corner", _corner, partial(part_moved, 1.0 / 3.0, 0.01)),
         Kind("map stretched by 1 %, corner", _corner, partial(stretched, 0.01)),
         Kind("map stretched by 1 %, wall", _wall, partial(stretched, 0.01)),

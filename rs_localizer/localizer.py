@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -39,15 +39,8 @@ from rs_localizer.estimation.calibration import (
 )
 from rs_localizer.estimation.hypotheses import Posterior, frame_posterior
 from rs_localizer.estimation.known_rotation import coupled_turn
-from rs_localizer.estimation.left_out import LeftOut, left_nearby, left_out
-from rs_localizer.estimation.moved_part import (
-    Look,
-    MovedPart,
-    MovedParts,
-    look_at,
-    moved_part,
-    neighbours_alike,
-)
+from rs_localizer.estimation.left_out import LeftOut, left_out
+from rs_localizer.estimation.moved_part import MovedParts, look_at, neighbours_alike
 from rs_localizer.estimation.points import (
     NEAREST,
     Observed,
@@ -410,16 +403,6 @@ class Localizer:
         focal = observed.assumed.focal_length
         return math.hypot(threshold, _MAP_GATE * deviation * focal / max(depth, NEAREST))
 
-    def _parts(
-        self, observed: Observed, posterior: Posterior, look: Callable[[], Look]
-    ) -> list[MovedPart]:
-        """Return the parts of the map that this frame, and those before, show elsewhere."""
-        here = None
-        if left_nearby(observed, posterior) and neighbours_alike(observed, posterior):
-            here = moved_part([look()], self.config.map_deviation, sides=False)
-        before = observed.parts.part if observed.parts is not None else None
-        return [part for part in (before, here) if part is not None]
-
     def _own_terms(self, observed: Observed, prior: Prior) -> PriorTerms:
         """Return the prior of a frame from itself and from the velocities of earlier frames.
 
@@ -445,14 +428,14 @@ class Localizer:
         if prior is not None and tracked:
             terms = self._own_terms(observed, prior)
         effect, rolling = NO_EFFECT, self._solver.rolling_shutter
-        watched = rolling and observed.exposure.alone
-        look = partial(look_at, observed, posterior, terms)
+        parts = observed.parts if rolling and observed.exposure.alone else None
+        part = None if parts is None else parts.part
+        effect_of = partial(
+            calibration_effect, observed, posterior, terms, self.config.calibration, tracked
+        )
         enough = np.count_nonzero(posterior.inliers) >= self.config.min_inliers
         if enough and posterior.determined and np.all(np.isfinite(posterior.state)):
-            effect = calibration_effect(
-                observed, posterior, terms, self.config.calibration, tracked,
-                self._parts(observed, posterior, look) if watched else (),
-            )  # fmt: skip
+            effect = effect_of(part)
         posterior = posterior._replace(
             declared=math.hypot(posterior.declared, effect.residual),  # px, of map and calibration
             speeding=speeding(observed, posterior.state),
@@ -469,8 +452,14 @@ class Localizer:
             odd = left_out(self._search, observed, posterior, gate, known=tracked)
         if odd.failure is not None:
             return odd.failure
-        if watched and observed.parts is not None:
-            observed.parts.add(look, partial(neighbours_alike, observed, posterior))
+        if parts is not None:
+            parts.add(
+                partial(look_at, observed, posterior, terms),
+                partial(neighbours_alike, observed, posterior),
+            )
+            if parts.part is not part:
+                effect = effect_of(parts.part)
         effect = widened(effect, posterior)
+        effect = effect._replace(covariance=effect.covariance + odd.other)
         estimate = estimate_of(observed, posterior, best.samples, effect, tracked)
         return replace(estimate, left_out=odd.notice) if odd.notice else estimate

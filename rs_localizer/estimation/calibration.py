@@ -16,7 +16,6 @@ moves motion and smooth error by ``-H^-1 A^T b``. A smooth error of ``f`` deviat
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -98,7 +97,7 @@ NO_EFFECT = CalibrationEffect(np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)), 
 
 def calibration_effect(
     observed: Observed, posterior: Posterior, terms: PriorTerms, deviation: CalibrationErrors,
-    tracked: bool, parts: Sequence[MovedPart] = (),
+    tracked: bool, part: MovedPart | None = None,
 ) -> CalibrationEffect:  # fmt: skip
     """Return the effect of errors of calibration and map on the motion of a frame.
 
@@ -106,7 +105,7 @@ def calibration_effect(
         terms: what is known of the motion but for poses of other frames, which are off by as much.
         tracked: poses of other frames are known, so that the covariance has no longer all of what
             the smooth error does.
-        parts: of the map that are elsewhere; what they leave of the points nobody has declared.
+        part: of the map that is elsewhere; what it leaves of the points nobody has declared.
     """
     observations, chosen = observed.observations, posterior.inliers
     exposure = observed.exposure
@@ -127,15 +126,14 @@ def calibration_effect(
             )
     declared = columns.shape[2]
     of_map = observed.error_modes
-    if of_map is not None or parts:
+    if of_map is not None or part is not None:
         places = observed.points[observed.usable.indices[chosen]]
-        each = [] if of_map is None else [of_map.at(places)]
-        moved = np.concatenate([*each, *(part.at(places) for part in parts)], axis=2)
-        declared += moved.shape[2] - 2 * len(parts)
+        modes = [each.at(places) for each in (of_map, part) if each is not None]
+        declared += modes[0].shape[2] if of_map is not None else 0
         # A camera that moves as the point does would move it the other way: of a deviation either
         # sign will do.
         by_point = by_motion[:, :, MOVE] @ rotation_of(posterior.state)
-        columns = np.concatenate([columns, by_point @ moved], axis=2)
+        columns = np.concatenate([columns, by_point @ np.concatenate(modes, axis=2)], axis=2)
     bend = posterior.bend[chosen] if posterior.bend.shape[1] else np.zeros((len(rays), 0))
     of_speeds = posterior.speeds if len(posterior.speeds) else _CONFIGURED
     smooth = posterior.shared * smooth_columns(by_motion, image, bend)

@@ -19,7 +19,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.lens import centre_of, off_centre
 from rs_localizer.core.reasons import Reason
-from rs_localizer.core.state import MOVE, PARAMETERS, TURN, step_between
+from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, TURN, step_between
 from rs_localizer.core.types import Failure
 from rs_localizer.estimation.acceptance import speeding
 from rs_localizer.estimation.calibration import promised
@@ -37,9 +37,9 @@ from rs_localizer.estimation.robust import (
 )
 from rs_localizer.estimation.search import GLOBAL_SHUTTER_SCALE, MotionSearch
 
-# So many points have a motion, a pose, or a shift, whatever they are; the corners of one marker may
-# be misplaced in the map.
-_SAMPLE, _OF_POSE, _OF_SHIFT, _MARKER = 6, 3, 2, 4
+# So many points have a motion, or a pose, whatever they are; the corners of one marker may be
+# misplaced in the map.
+_SAMPLE, _OF_POSE, _MARKER = 6, 3, 4
 # Explanations that chance makes in one frame of 1,000 (Desolneux, Moisan and Morel, IJCV 2000: the
 # number of false alarms).
 _LEAST_CHANCE = -math.log(1e-3)
@@ -85,6 +85,8 @@ class LeftOut(NamedTuple):
 
     failure: Failure | None = None
     notice: str = ""
+    other: Array = np.zeros((MOTION_PARAMETERS,) * 2)
+    """Second moment of the motion of points that are left out, about the frame's."""
 
 
 class _Group(NamedTuple):
@@ -93,6 +95,7 @@ class _Group(NamedTuple):
     chosen: BoolArray  # (n,)
     state: Array  # (24,)
     squared_errors: Array  # (n,) px^2
+    covariance: Array = np.zeros((PARAMETERS,) * 2)  # of the motion
 
 
 def left_out(
@@ -137,20 +140,15 @@ def left_out(
     )
     faster = max(posterior.speeding - speeding(observed, second.state), 0.0)
     if _odds(found, size, faster) > (1.0 if known else _LEAST_ODDS):
-        return LeftOut(notice=f"{text}: have these points been moved, or do they move?")
+        # A part is one thing, however many of its landmarks a frame shows: either may have moved.
+        moment = np.outer(step, step) + second.covariance
+        other = size / (found + size) * moment[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
+        return LeftOut(None, f"{text}: have these points been moved, or do they move?", other)
     return LeftOut(Failure(
         Reason.MODEL_ERROR,
         f"{text}: which of both is the camera's? A part of the map was moved, or the calibration "
         "is grossly wrong",
     ))  # fmt: skip
-
-
-def left_nearby(observed: Observed, posterior: Posterior) -> bool:
-    """Return whether more of the points that are left out lie near their places than by chance."""
-    left = posterior.squared_errors[~posterior.inliers]
-    circle = (GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length) ** 2
-    near, chance = int(np.count_nonzero(left < circle)), math.pi * circle / _area(observed)
-    return _surprise(len(left), near, _OF_SHIFT, chance) > _LEAST_CHANCE
 
 
 def _cameras_apart(observed: Observed, inliers: BoolArray, second: _Group, threshold: float) -> str:
@@ -216,7 +214,8 @@ def _own_motion(
         return None
     chosen = observations.only(np.flatnonzero(group))
     best = best_motion(chosen.packed, chosen.count, own.state, observed.terms, threshold)
-    return _Group(group, best.state, observations.squared_errors(best.state))
+    errors = observations.squared_errors(best.state)
+    return _Group(group, best.state, errors, best.covariance)
 
 
 def _area(observed: Observed) -> float:

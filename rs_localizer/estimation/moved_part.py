@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOVE, PARAMETERS, rotation_of
 from rs_localizer.estimation.hypotheses import Posterior
@@ -32,7 +32,7 @@ from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.robust import LEAST_NOISE, TINY, WIDEST_GATE
 from rs_localizer.estimation.search import GLOBAL_SHUTTER_SCALE
 
-# Frames that are compared, and after how many others at most: it takes some 20 ms.
+# Frames that are compared, and after how many others at most.
 _LOOKS, _RARELY = 4, 60
 # Neighbours of a landmark that are compared with it, deviations of chance by which they are alike,
 # and landmarks that are enough.
@@ -42,14 +42,16 @@ _LEAST_CHANCE = -math.log(1e-3)
 # Declared deviations of two landmarks within which they are no two parts.
 _DECLARED = 3.0 * math.sqrt(2.0)
 # Parts from which the search starts, beyond these quantiles along the axes and their diagonals.
-_QUANTILES, _STARTS = (0.2, 0.35, 0.5, 0.65, 0.8), 1
+_QUANTILES = (0.2, 0.35, 0.5, 0.65, 0.8)
 _ALONG = np.array([
     (x, y, z) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0) for z in (-1.0, 0.0, 1.0)
 ])[14:]  # fmt: skip
 # So many landmarks have a shift, whatever they are.
 _OF_SHIFT = 2
 # Rounds of labels and fits: they mostly agree after four.
-_ROUNDS = 6
+_ROUNDS = 4
+# Weights that make one number of a landmark's place, which no other place shares.
+_KEY = np.sqrt([2.0, 3.0, 5.0])
 # Of diagonals of normal equations, so that rounding leaves them positive.
 _RIDGE = 1e-9
 
@@ -58,8 +60,7 @@ class Look(NamedTuple):
     """Errors of a frame's landmarks, linearized at its motion."""
 
     points: Array  # (n,3) m, as the map has them
-    errors: Array  # (n,2) px
-    by_place: Array  # (n,2,3) px per m, derivatives of the errors by the places in the map
+    rows: Array  # (n,2,4) px: errors, and their derivatives by the places in the map (px per m)
     columns: Array  # (n,2,p) px, by motion and smooth error
     prior: Array  # (p,p) information on those, times the variance of the noise, if errors are 1 px
     sizes: tuple[float, float]  # px, of the smooth error: as it was found, and as is declared
@@ -94,20 +95,18 @@ def look_at(observed: Observed, posterior: Posterior, terms: PriorTerms) -> Look
     """
     seen, variance = observed.observations, posterior.noise**2
     lines = linearized(seen.packed, len(seen), posterior.state, shake_at(seen.tau, posterior.shake))
-    circle = (GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length) ** 2
-    near = np.flatnonzero(np.sum(lines.errors**2, axis=1) < circle)  # NaN is not
-    by_motion, bend = lines.by_motion[near], np.zeros((len(near), 0))
-    if posterior.bend.shape[1]:
-        bend = posterior.bend[near]
+    near = _near(observed, lines.errors)
+    by_motion = lines.by_motion[near]
+    bend = posterior.bend[near] if posterior.bend.shape[1] else np.zeros((len(by_motion), 0))
     smooth = smooth_columns(by_motion, lines.image[near], bend)
     columns = np.concatenate([by_motion[:, :, :PARAMETERS], smooth], axis=2)
     prior, motion = variance * np.eye(columns.shape[2]), slice(0, PARAMETERS)
     prior[motion, motion] = variance * known_at(terms, posterior.state).form[motion, motion]
+    by_place = -by_motion[:, :, MOVE] @ rotation_of(posterior.state)
     sizes = posterior.shared, math.hypot(posterior.declared, ORDINARY)
     return Look(
         observed.points[observed.usable.indices[near]],
-        -lines.errors[near],
-        -by_motion[:, :, MOVE] @ rotation_of(posterior.state),
+        np.concatenate([-lines.errors[near, :, None], by_place], axis=2),
         columns,
         prior,
         sizes,
@@ -158,7 +157,10 @@ def neighbours_alike(observed: Observed, posterior: Posterior) -> bool:
 
     Moran's I, of both coordinates: it takes a fraction of what a search for parts does.
     """
-    errors, near = _errors(observed, posterior)
+    seen = observed.observations
+    shake = shake_at(seen.tau, posterior.shake)
+    errors: Array = linearized(seen.packed, len(seen), posterior.state, shake).errors
+    near = np.flatnonzero(_near(observed, errors))
     near = near[:: 1 + len(near) // _COMPARED]
     count = len(near)
     if count <= 2 * _NEIGHBOURS:
@@ -174,23 +176,68 @@ def neighbours_alike(observed: Observed, posterior: Posterior) -> bool:
     return index + 1.0 / count > _ALIKE / math.sqrt(2.0 * count * _NEIGHBOURS / 1.5)
 
 
-def _errors(observed: Observed, posterior: Posterior) -> tuple[Array, IntArray]:
-    """Return errors (n,2) px of all points, and which lie near their places."""
-    seen = observed.observations
-    shake = shake_at(seen.tau, posterior.shake)
-    errors: Array = linearized(seen.packed, len(seen), posterior.state, shake).errors
-    circle = (GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length) ** 2
-    return errors, np.flatnonzero(np.sum(errors**2, axis=1) < circle)  # NaN is not
+def _near(observed: Observed, errors: Array) -> BoolArray:
+    """Return which points lie near their places."""
+    circle = GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length
+    near: BoolArray = np.sum(errors**2, axis=1) < circle**2  # NaN is not
+    return near
+
+
+class _Frames(NamedTuple):
+    """Looks of f frames at the same m landmarks; rows of those that a frame does not show are 0."""
+
+    points: Array  # (m,3)
+    rows: Array  # (f,m,2,4)
+    columns: Array  # (f,m,2,p)
+    priors: Array  # (2,f,p,p) with smooth errors as they were found, and as is declared
+    shown: BoolArray  # (f,m)
+    inliers: BoolArray  # (f,m)
+    reach: Array  # (f,1) px
+    area: Array  # (f,1) px
+
+    @classmethod
+    def of(cls, looks: Sequence[Look]) -> _Frames:
+        """Put the landmarks of looks in order: of many, those that most frames show."""
+        points = np.concatenate([look.points for look in looks])
+        keys = points @ _KEY
+        _, first, which, seen = np.unique(
+            keys, return_index=True, return_inverse=True, return_counts=True
+        )
+        some = np.argsort(-seen, kind="stable")[:_COMPARED]
+        place = np.full(len(seen), -1)
+        place[some] = np.arange(len(some))
+        sizes = len(looks), len(some)
+        most = max(look.columns.shape[2] for look in looks)
+        rows, columns = np.zeros((*sizes, 2, 4)), np.zeros((*sizes, 2, most))
+        shown, inliers = np.zeros(sizes, np.bool_), np.zeros(sizes, np.bool_)
+        priors = np.tile(np.eye(most), (2, len(looks), 1, 1))
+        ends = np.cumsum([len(look.points) for look in looks])[:-1]
+        for k, (look, own) in enumerate(zip(looks, np.split(place[which], ends), strict=True)):
+            here, own, taken = own >= 0, own[own >= 0], len(look.prior)
+            rows[k, own], columns[k, own, :, :taken] = look.rows[here], look.columns[here]
+            shown[k, own], inliers[k, own] = True, look.inliers[here]
+            for prior, size in zip(priors[:, k], look.sizes, strict=True):
+                scale = np.ones(taken)
+                scale[PARAMETERS:] = max(size, LEAST_NOISE)
+                prior[:taken, :taken] = look.prior / np.outer(scale, scale)
+        reach, area = np.array([(look.reach, look.area) for look in looks]).T[:, :, None]
+        return cls(points[first[some]], rows, columns, priors, shown, inliers, reach, area)
+
+
+class _Beside(NamedTuple):
+    """The points that are kept, and what motions and smooth errors take up of them."""
+
+    flat: Array  # (f,2m,p)
+    inverse: Array  # (f,p,p)
+    freedom: float
 
 
 class _Shifted(NamedTuple):
     """The frames, fitted with one part that is shifted."""
 
     way: Array  # (3,) m
-    costs: Array  # (2,m) px^2 of landmarks that lie where the map has them, or are shifted
-    apart: list[Array]  # (2,n) likewise of the points of each frame
-    squares: float  # px^2
-    freedom: float
+    each: Array  # (2,f,m) px^2, of landmarks that lie where the map has them, or are shifted
+    evidence: float  # logarithm, of the points that are kept; the others are anywhere in an image
 
 
 class _Split(NamedTuple):
@@ -202,37 +249,23 @@ class _Split(NamedTuple):
     way: Array  # (3,) m
 
 
-class _Frames(NamedTuple):
-    """Frames, and the landmarks that they show."""
-
-    looks: Sequence[Look]
-    which: list[IntArray]  # landmarks (n,) of each frame
-    points: Array  # (m,3) of the landmarks
-
-
-def moved_part(looks: Sequence[Look], map_deviation: float, sides: bool = True) -> MovedPart | None:
+def moved_part(looks: Sequence[Look], map_deviation: float) -> MovedPart | None:
     """Return the part of the map that lies elsewhere than the rest; None if there is none.
 
     Args:
         looks: of one frame, or of several.
         map_deviation: m, as declared.
-        sides: whether also parts are looked for that have no point which is left out.
     """
-    frames = _frames(looks)
-    points = frames.points
-    kept = [look.inliers for look in looks]
-    nothing = np.zeros(len(points), np.bool_)
-    alone = _fitted(frames, nothing, kept, declared=False)
-    first = _evidence(frames, alone, kept)
-    fitting = nothing.copy()
-    for own, look in zip(frames.which, looks, strict=True):
-        fitting[own[look.inliers]] = True
-    starts = [] if fitting.all() else [~fitting]
-    if sides:
-        starts += _sides(frames, fitting)
+    frames = _Frames.of(looks)
+    points, fitting = frames.points, frames.inliers.any(axis=0)
+    alone = _beside(frames, frames.inliers, declared=False)
+    first = _fitted(frames, alone, np.zeros(len(points), np.bool_), frames.inliers)
+    starts = [_side(frames, alone, fitting)]
+    if not fitting.all():
+        starts.append(~fitting)
     splits = [split for start in starts if (split := _settled(frames, start))]
     best = max(splits, key=lambda split: split.gain, default=None)
-    if best is None or best.gain < first + _LEAST_CHANCE:
+    if best is None or best.gain < first.evidence + _LEAST_CHANCE:
         return None
     if float(np.linalg.norm(best.way)) <= _DECLARED * map_deviation:
         return None
@@ -242,117 +275,88 @@ def moved_part(looks: Sequence[Look], map_deviation: float, sides: bool = True) 
     return MovedPart(points[part], points[rest], way)
 
 
-def _frames(looks: Sequence[Look]) -> _Frames:
-    """Number the landmarks of frames."""
-    if len(looks) == 1:
-        return _Frames(looks, [np.arange(len(looks[0].points))], looks[0].points)
-    points, which = np.unique(
-        np.concatenate([look.points for look in looks]), axis=0, return_inverse=True
-    )
-    ends = np.cumsum([len(look.points) for look in looks])[:-1]
-    return _Frames(looks, np.split(which.ravel(), ends), points)
-
-
-def _fitted(
-    frames: _Frames, part: BoolArray, kept: Sequence[BoolArray], declared: bool = True
-) -> _Shifted:
-    """Fit motions, smooth errors and the shift of a part to the points that are kept.
+def _beside(frames: _Frames, kept: BoolArray, declared: bool) -> _Beside:
+    """Eliminate motions and smooth errors of the points (f,m) that are kept.
 
     ``declared``: smooth errors are as large as is declared, and not as without a part.
     """
-    information, target, squares, freedom = np.zeros((3, 3)), np.zeros(3), 0.0, 0.0
-    solved = []
-    for look, own, these in zip(frames.looks, frames.which, kept, strict=True):
-        flat, inverse, taken = _beside(look, these, declared)
-        shifted = (look.by_place * part[own][:, None, None])[these].reshape(len(flat), 3)
-        errors = look.errors[these].ravel()
-        by_shift, along = flat.T @ shifted, flat.T @ errors
-        beside, back = inverse @ by_shift, inverse @ along
-        information += shifted.T @ shifted - by_shift.T @ beside
-        target += shifted.T @ errors - by_shift.T @ back
-        squares += float(errors @ errors - along @ back)
-        freedom += len(errors) - taken
-        solved.append((beside, back))
+    flat = (frames.columns * kept[:, :, None, None]).reshape(len(kept), -1, frames.columns.shape[3])
+    normal = np.swapaxes(flat, 1, 2) @ flat
+    weight = normal + frames.priors[int(declared)]
+    places = np.arange(weight.shape[1])
+    weight[:, places, places] *= 1.0 + _RIDGE
+    inverse = np.asarray(np.linalg.inv(weight), np.float64)
+    freedom = 2.0 * np.count_nonzero(kept) - float(np.sum(inverse * normal))
+    return _Beside(flat, inverse, freedom)
+
+
+def _fitted(frames: _Frames, beside: _Beside, part: BoolArray, kept: BoolArray) -> _Shifted:
+    """Fit motions, smooth errors and the shift of a part to the points that are kept."""
+    own = frames.rows * kept[:, :, None, None]
+    own[..., 1:] *= part[:, None, None]
+    own = own.reshape(len(own), -1, 4)
+    along = np.swapaxes(beside.flat, 1, 2) @ own
+    back = beside.inverse @ along
+    square = np.sum(np.swapaxes(own, 1, 2) @ own - np.swapaxes(along, 1, 2) @ back, axis=0)
+    information, target = square[1:, 1:].copy(), square[1:, 0]
     information += max(_RIDGE * float(np.trace(information)), TINY) * np.eye(3)
     way = np.asarray(np.linalg.solve(information, target), np.float64)
-    costs, apart = np.zeros((2, len(part))), []
-    for look, own, (beside, back) in zip(frames.looks, frames.which, solved, strict=True):
-        left = look.errors - look.columns @ (back - beside @ way)
-        each = np.stack([
-            np.sum(left**2, axis=1), np.sum((left - look.by_place @ way) ** 2, axis=1)
-        ])  # fmt: skip
-        np.add.at(costs.T, own, each.T)
-        apart.append(each)
-    return _Shifted(way, costs, apart, squares - float(target @ way), freedom)
-
-
-def _beside(look: Look, kept: BoolArray, declared: bool = True) -> tuple[Array, Array, float]:
-    """Return columns (2n,p) of motion and smooth error, their covariance, and what they take up."""
-    flat = look.columns[kept].reshape(-1, len(look.prior))
-    normal, prior = flat.T @ flat, look.prior.copy()
-    smooth = np.arange(PARAMETERS, len(prior))
-    prior[smooth, smooth] /= max(look.sizes[declared], LEAST_NOISE) ** 2
-    weight = normal + prior
-    weight[np.diag_indices(len(weight))] *= 1.0 + _RIDGE
-    inverse = np.asarray(np.linalg.inv(weight), np.float64)
-    return flat, inverse, float(np.sum(inverse * normal))
-
-
-def _evidence(frames: _Frames, fit: _Shifted, kept: Sequence[BoolArray]) -> float:
-    """Return the log evidence of the points that are kept, the others anywhere in an image."""
-    variance = max(fit.squares / max(fit.freedom, 1.0), LEAST_NOISE**2)
-    each, total = math.log(2.0 * math.pi * variance) + 1.0, 0.0
-    for look, these in zip(frames.looks, kept, strict=True):
-        inside = np.count_nonzero(these)
-        total -= inside * each + (len(these) - inside) * math.log(look.area)
-    return total
+    found = back @ np.array([1.0, *-way])
+    left = frames.rows[..., 0] - (frames.columns @ found[:, None, :, None])[..., 0]
+    each = np.stack([left, left - frames.rows[..., 1:] @ way])
+    squares = float(square[0, 0] - target @ way)
+    variance = max(squares / max(beside.freedom, 1.0), LEAST_NOISE**2)
+    inside = np.count_nonzero(kept)
+    out = float(np.sum((frames.shown & ~kept) * np.log(frames.area)))
+    evidence = -inside * (math.log(2.0 * math.pi * variance) + 1.0) - out
+    return _Shifted(way, np.sum(each**2, axis=3) * frames.shown, evidence)
 
 
 def _settled(frames: _Frames, part: BoolArray) -> _Split | None:
     """Let each landmark join the group that it fits, until none changes; None if one vanishes."""
-    kept = [np.ones(len(look.points), np.bool_) for look in frames.looks]
+    kept = frames.shown
+    beside = _beside(frames, kept, declared=True)
     for _ in range(_ROUNDS):
-        fit = _fitted(frames, part, kept)
-        before, part = part, fit.costs[1] < fit.costs[0]
-        near = [
-            np.where(part[own], each[1], each[0]) < look.reach**2
-            for look, own, each in zip(frames.looks, frames.which, fit.apart, strict=True)
-        ]
-        settled = np.array_equal(part, before) and all(map(np.array_equal, near, kept))
-        kept = near
-        if settled or np.count_nonzero(part) <= _OF_SHIFT:
+        fit = _fitted(frames, beside, part, kept)
+        before, costs = part, fit.each.sum(axis=1)
+        part = costs[1] < costs[0]
+        near = frames.shown & (np.where(part, fit.each[1], fit.each[0]) < frames.reach**2)
+        moved, kept = not np.array_equal(near, kept), near
+        if np.count_nonzero(part) <= _OF_SHIFT:
+            return None
+        if moved:
+            beside = _beside(frames, kept, declared=True)
+        elif np.array_equal(part, before):
             break
-    found = np.zeros(len(part), np.bool_)
-    for own, these in zip(frames.which, kept, strict=True):
-        found[own[these]] = True
+    else:
+        fit = _fitted(frames, beside, part, kept)
+    found = kept.any(axis=0)
     count, size = int(np.count_nonzero(found)), int(np.count_nonzero(part & found))
     if not _OF_SHIFT < size < count:
         return None
-    fit = _fitted(frames, part, kept)
-    rows = 2.0 * sum(np.count_nonzero(these) for these in kept)
     labels = math.lgamma(count + 1) - math.lgamma(size + 1) - math.lgamma(count - size + 1)
-    gain = _evidence(frames, fit, kept) - labels - math.log(count) - 1.5 * math.log(rows)
-    return _Split(gain, part, found, fit.way)
+    choices = labels + math.log(count) + 1.5 * math.log(2.0 * np.count_nonzero(kept))
+    return _Split(fit.evidence - choices, part, found, fit.way)
 
 
-def _sides(frames: _Frames, fitting: BoolArray) -> list[BoolArray]:
-    """Return the sides of planes through the map whose shifts explain most."""
+def _side(frames: _Frames, beside: _Beside, fitting: BoolArray) -> BoolArray:
+    """Return the side of a plane through the map whose shift explains most."""
     away = frames.points - frames.points[fitting].mean(axis=0)
     values, axes = np.linalg.eigh(away[fitting].T @ away[fitting])
     places = away @ axes / np.sqrt(np.maximum(values, 1e-4 * values[-1])) @ _ALONG.T
     edges = np.quantile(places[fitting], _QUANTILES, axis=0)
     sides = np.concatenate([(places > edge).T for edge in edges]).astype(np.float64)
-    information, targets = np.zeros((len(sides), 3, 3)), np.zeros((len(sides), 3))
-    for look, own in zip(frames.looks, frames.which, strict=True):
-        these = look.inliers
-        flat, inverse, _ = _beside(look, these)
-        by_place, errors, of = look.by_place[these], look.errors[these], sides[:, own[these]]
-        count, rows = len(by_place), np.swapaxes(by_place, 1, 2)
-        by_shift = (of @ (rows @ look.columns[these]).reshape(count, -1)).reshape(len(of), 3, -1)
-        information += (of @ (rows @ by_place).reshape(count, 9)).reshape(-1, 3, 3)
-        information -= by_shift @ inverse @ np.swapaxes(by_shift, 1, 2)
-        targets += of @ np.einsum("nra,nr->na", by_place, errors)
-        targets -= by_shift @ (inverse @ (flat.T @ errors.ravel()))
+    own = frames.rows * frames.inliers[:, :, None, None]
+    squares = np.zeros((len(sides), 4, 4))  # of a shift of all, and of the errors
+    for rows, flat, inverse in zip(own, beside.flat, beside.inverse, strict=True):
+        turned, count = np.swapaxes(rows, 1, 2), len(rows)
+        along = (turned @ flat.reshape(count, 2, -1)).reshape(count, -1)
+        by_side = (sides @ along).reshape(len(sides), 4, -1)
+        by_side[:, 0] = along.reshape(count, 4, -1)[:, 0].sum(axis=0)
+        squares += (sides @ (turned @ rows).reshape(count, -1)).reshape(-1, 4, 4)
+        squares -= by_side @ inverse @ np.swapaxes(by_side, 1, 2)
+    information, targets = squares[:, 1:, 1:], squares[:, 1:, 0]
     information += max(_RIDGE * float(information[0].trace()), TINY) * np.eye(3)
-    gains = np.einsum("sa,sa->s", targets, np.linalg.solve(information, targets[..., None])[..., 0])
-    return [sides[k] > 0.5 for k in np.argsort(-gains)[:_STARTS]]
+    shifts = np.linalg.solve(information, targets[..., None])[..., 0]
+    found: BoolArray = sides[np.argmax(np.sum(targets * shifts, axis=1))] > 0.5
+    return found

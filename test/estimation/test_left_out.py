@@ -139,6 +139,12 @@ def test_a_moved_corner_is_a_notice():
     assert not result.inliers[moved].any()
     assert "left out have a pose of their own" in result.left_out
     assert np.abs(result.rotation - rotation).max() < 0.01
+    # Or the room was moved, and not the corner: with the share of that, the camera is half a metre
+    # away.
+    along = result.rotation @ (0.0, 1.0, 0.0)
+    share = len(moved) / len(points)
+    deviation = np.sqrt(along @ result.covariance[3:6, 3:6] @ along)
+    assert deviation == pytest.approx(0.5 * np.sqrt(share), rel=0.15)
 
 
 @pytest.mark.parametrize(

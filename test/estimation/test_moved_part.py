@@ -40,6 +40,16 @@ def test_half_of_a_map_that_was_moved_is_named_with_its_ids():
     assert abs(float(words[words.index("mm") - 1]) - 10.0) < 1.5
 
 
+@pytest.mark.parametrize("distance", [0.02, 0.3])
+def test_regions_hold_whichever_half_was_moved(distance):
+    """Within the gates of inliers, and beyond all of them."""
+    fault = partial(kinds.part_moved, 0.5, distance)
+    found = kinds.judged(kinds.Kind("half map moved", kinds._room, fault), 1)
+    assert found.published > 50
+    assert found.inside[0] > 0.9 * found.published
+    assert found.beyond == 0
+
+
 @pytest.mark.parametrize(
     "fault",
     [
