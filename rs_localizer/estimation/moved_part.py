@@ -146,7 +146,9 @@ class MovedParts:
                 return
         self._looks.append(look())
         if len(self._looks) in (1, _LOOKS):
-            self.part = moved_part(self._looks, self._map_deviation)
+            found = moved_part(self._looks, self._map_deviation)
+            if found is not None or len(self._looks) == _LOOKS:
+                self.part = found
         if len(self._looks) == _LOOKS:
             self._looks.clear()
             self._next = self._count + min(self._count, _RARELY)
