@@ -196,7 +196,7 @@ _JOLTS = 10.0
 # Least part of the configured linear velocity that goes with a slower turn.
 _WALKING = 0.1
 
-SPEEDS = (0.0, 0.03, 0.1, 1.0)
+SPEEDS = (0.0, 0.03, 0.1, 0.3, 1.0)
 """Typical speeds, as parts of the configured one; 0 is a camera at rest."""
 
 
