@@ -238,7 +238,7 @@ class FrameLocalizer(ABC):
         """
         pose, twist = published_motion(
             estimate, moment, self._config, next(iter(self._cameras.values())), deviation,
-            self.shutter.is_global,
+            self.shutter,
         )  # fmt: skip
         seen = np.asarray(estimate.inliers) if len(cloud.table) else np.zeros(0, np.bool_)
         return self.mounted(

@@ -38,6 +38,7 @@ from rs_localizer.core.shutter import Numbers, numbers_of
 from rs_localizer.core.state import MOTION_PARAMETERS
 from rs_localizer.core.types import Estimate, beyond_rows
 from rs_localizer.io.outputs import BodyPose, Twist
+from rs_localizer.shutter_watch import ShutterWatch
 from rs_localizer.solvers.table import SOLVERS
 
 
@@ -98,7 +99,7 @@ def with_timing(
 
 def published_motion(
     estimate: Estimate, moment: PublishedMoment, config: NodeConfig, camera: Camera,
-    deviation: float, is_global: bool,
+    deviation: float, watch: ShutterWatch,
 ) -> tuple[BodyPose, Twist | None]:  # fmt: skip
     """Return pose and twist of the camera at a moment; no twist where frames tell none.
 
@@ -107,18 +108,19 @@ def published_motion(
         moment: for which they are valid.
         config: settings.
         camera: the first one.
-        deviation: s, of the readout time.
-        is_global: the shutter is known to be global: an image says nothing of velocities.
+        deviation: s, of the readout time as it is given.
+        watch: of the shutter; before a global one an image says nothing of velocities.
     """
     readout_time, (_, tau, there) = estimate.span, moment
     moving = readout_time > 0.0 and SOLVERS[config.solver].rolling_shutter
-    moving = moving and (estimate.aided or not is_global)
+    moving = moving and (estimate.aided or not watch.is_global)
     motion, at = (estimate, tau) if there is None else (there, 0.0)
     pose = pose_at(motion, at)
     twist = twist_at(motion, at, readout_time) if moving else None
-    if twist is not None and deviation > 0.0:
+    late = max(deviation, watch.error)
+    if twist is not None and late > 0.0:
         # The middle row comes later where the readout takes longer; the first one does not.
-        delay = deviation * camera.first_row_time * (tau == 0.0)
+        delay = late * camera.first_row_time * (tau == 0.0)
         return with_timing(pose, twist, deviation / readout_time, delay, config.acceleration)
     return pose, twist
 
