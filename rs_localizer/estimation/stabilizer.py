@@ -48,6 +48,11 @@ class RowRotations:
         self.is_certain = False
         """Whether a stabilizer turned the images."""
 
+    @property
+    def are_enough(self) -> bool:
+        """Whether vibration near the rate of the images would show."""
+        return len(self._last) >= _LEAST
+
     def __len__(self) -> int:
         return len(self._last)
 
@@ -68,7 +73,7 @@ class RowRotations:
         weights = np.linalg.inv(covariances[:, :3, :3])
         smooth, rate = _likeness(turned[:, :3], weights)
         self.most = rate if smooth > _LIKELY else 0.0
-        if len(self._last) < _LEAST:
+        if not self.are_enough:
             return
         rates = _varying(turned[:, :3], weights, by_shutter[:, :3])
         self._smooth, self.rate = _likeness(rates, weights)
