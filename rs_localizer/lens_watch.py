@@ -16,12 +16,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from rs_localizer.config import LocalizerConfig
+from rs_localizer.config import CalibrationErrors, LocalizerConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure
 from rs_localizer.core.scanning import VERTICAL
-from rs_localizer.core.state import ANGULAR
+from rs_localizer.core.state import ANGULAR, LINEAR
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.frames_together import FRAMES, Fitted, FramesTogether, Matrix
 
@@ -35,9 +35,9 @@ _OF_DISTORTION = 0.6
 # So many of so many frames that another camera matrix explains are no chance: of twelve real boards
 # none has one.
 _OTHERS, _OF_THE_LAST = 2, 30
-# Frames are compared again after as many as before, and after so many at most: it takes 5 to 30 ms.
-# Others follow sooner as long as these do not tell the focal length.
-_RARELY, _SOON = 192, 8
+# Frames are compared again when an eighth more have come, each once; as soon as they tell the focal
+# length, after as many as before, and after so many at most.
+_SOON, _RARELY = 8, 192
 # Intervals (s) over which a parabola is a hand's motion.
 _LONGEST_INTERVAL = 0.15
 # Beyond this (logarithm) fy over fx is not the image's, and no pose is told.
@@ -67,7 +67,7 @@ class LensWatch:
         self._together: FramesTogether | None = None
         if self._exposure is not None:
             self._together = FramesTogether(self._exposure, self._config)
-        self._count, self._next = 0, FRAMES
+        self._count, self._next, self._jumped = 0, FRAMES, False
 
     @property
     def matrix(self) -> Matrix | None:
@@ -89,19 +89,37 @@ class LensWatch:
         others = [text for text in self._others if text]
         return others[-1] if len(others) >= _OTHERS else ""
 
-    def widened(self, found: Estimate) -> Estimate:
-        """Return a frame with a covariance that allows for fy over fx as frames have it.
+    @property
+    def calibration(self) -> CalibrationErrors:
+        """Deviations that allow for a camera matrix that frames doubt."""
+        given = self._config.calibration
+        if self._together is None or not self._together.doubt.any():
+            return given
+        length, aspect = np.hypot(
+            self._together.doubt, [given.focal_length, given.aspect_ratio]
+        ).tolist()
+        return replace(given, focal_length=min(length, 1.0), aspect_ratio=min(aspect, 1.0))
 
-        A camera whose fy over fx is off by ``s`` reads that as a pitch rate of ``s`` times the
-        height over the focal length.
+    def widened(self, found: Estimate, points: Array) -> Estimate:
+        """Return a frame whose velocities allow for another camera matrix, if frames doubt K.
+
+        Before a board that is farther away by a share, ways are longer by it, and what turns the
+        camera and what moves it across are told apart as badly as its tilt. A camera whose fy over
+        fx is off by ``s`` reads that as a pitch rate of ``s`` times the height over the focal
+        length.
         """
-        if self._exposure is None or self._together is None or not self._together.squeeze:
+        if self._exposure is None or self._together is None or not self._together.doubt.any():
             return found
-        (camera,) = self._exposure.cameras
+        (camera,), (length, aspect) = self._exposure.cameras, self._together.doubt.tolist()
         axis = int(camera.scan_direction not in VERTICAL)
-        rate = self._together.squeeze * camera.size[1 - axis] / camera.focal_length
+        depth = float(np.median(points @ found.rotation[2])) + found.translation[2]
+        rate, speed = map(np.linalg.norm, (found.angular_velocity, found.linear_velocity))
         calibration = found.calibration_covariance.copy()
-        calibration[ANGULAR, ANGULAR][axis, axis] += rate**2
+        calibration[ANGULAR, ANGULAR] += (length * rate) ** 2 * np.eye(3)
+        calibration[ANGULAR, ANGULAR][axis, axis] += (
+            aspect * camera.size[1 - axis] / camera.focal_length
+        ) ** 2
+        calibration[LINEAR, LINEAR] += length**2 * (speed**2 + (depth * rate) ** 2) * np.eye(3)
         return replace(found, calibration_covariance=calibration)
 
     def add(
@@ -112,8 +130,9 @@ class LensWatch:
 
         ``jumped``: no camera goes there from the last frame, nor does a parabola.
         """
-        if jumped:
+        if jumped and not self._jumped:  # who jumps on and on is seen wrongly, not moved
             self._posed.clear()
+        self._jumped = jumped
         if not found:
             self._others.append(found.detail if found.reason is Reason.CALIBRATION else "")
             return
@@ -149,8 +168,10 @@ class LensWatch:
         if len(self._posed) < FRAMES or self._count < self._next:
             return
         self._together.add(list(self._posed))
-        most = _RARELY if self._together.is_enough else _SOON
-        self._next = self._count + min(self._count, most)
+        if self._together.is_enough:
+            self._next = self._count + min(self._count, _RARELY)
+        else:
+            self._next = self._count + max(self._count // _SOON, FRAMES)
 
     def is_beyond(self, found: Estimate) -> bool:
         """Return whether one frame's smooth error is beyond what is declared."""

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rs_localizer.config import Acceleration, RefinementKind
+from rs_localizer.config import Acceleration, CalibrationErrors, RefinementKind
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray, instance
 from rs_localizer.core.reasons import Reason
@@ -154,6 +154,7 @@ class Tracker:
         if not 0.0 <= max_prediction < math.inf:
             raise ValueError(f"max_prediction must be 0 s or more, got {max_prediction!r}")
         self.localizer, self.remembers_motion = localizer, remembers_motion
+        self._allowing = localizer  # for a camera matrix that frames doubt
         self.output_lag, self.max_prediction = int(output_lag), max_prediction
         self._seen: deque[_Seen] = deque(maxlen=LENGTH)  # the newest last
         self._images = RepeatedImages()
@@ -181,6 +182,7 @@ class Tracker:
         self._images, self.repeats = RepeatedImages(), False
         self.shutter.reset()
         self.lens.reset()
+        self._allowing = self.localizer
         if self.aid is not None:
             self.aid.reset()
 
@@ -207,7 +209,7 @@ class Tracker:
 
     def mount(self, rig: Rig) -> None:
         """Set new mounts of the same cameras; the rig's axes stay the same."""
-        self.localizer = Localizer(rig, self.localizer.config)
+        self.localizer = self._allowing = Localizer(rig, self.localizer.config)
 
     def _trusts_motion(self, context: FrameContext) -> bool:
         """Return whether motion between frames predicts the motion within one."""
@@ -420,7 +422,7 @@ class Tracker:
         share = 0.0 if self._track is None else self._track.share
 
         def find(prior: Prior | None, rotation: RotationPrior | None = None) -> Estimate | Failure:
-            return self.localizer.find(
+            return self._allowing.find(
                 points,
                 pixels,
                 scores,
@@ -440,10 +442,13 @@ class Tracker:
             jumped = self._has_jumped(time_ns, prior, result)
             seen = np.asarray(points, float), np.asarray(pixels, float)
             self.lens.add(time_ns, result, *seen, jumped=jumped)
+            self._allow(self.lens.calibration)
             if self.lens.matrix is None:
                 self.shutter.add(time_ns, result, *seen, jumped=jumped)
         if result:
-            result = self.lens.widened(self._judged(time_ns, result, points, prior))
+            result = self._judged(time_ns, result, points, prior)
+            if pixels is not None:
+                result = self.lens.widened(result, seen[0])
             result = self.shutter.widened(result)
             if self.remembers_motion:
                 result = self._covering(replace(result, time_ns=time_ns), context)
@@ -452,6 +457,13 @@ class Tracker:
         self._images.add(time_ns, points, pixels)
         self._publish()
         return self.delayed
+
+    def _allow(self, calibration: CalibrationErrors) -> None:
+        """Let the next frames have these deviations."""
+        self._allowing = self.localizer
+        if calibration != self.localizer.config.calibration:
+            self._allowing = copy(self.localizer)
+            self._allowing.config = replace(self.localizer.config, calibration=calibration)
 
     def _fitted(
         self, time_ns: int, foreseen: Foretold | None, span: float | None,

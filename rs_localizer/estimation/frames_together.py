@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import copy
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -40,10 +41,10 @@ _MOST = 60
 # Threes that are kept: those that tell most of the focal length (its logarithm). It is known if its
 # deviation is less than the second.
 _KEPT, _KNOWN = 8, 0.02
-# Rounds of Gauss and Newton, the last of which moves no pose and no number by more than this (with
-# 4e-3 wrong lenses are told late). A three is linearized anew if the shared numbers are farther
-# away than the last.
-_ROUNDS, _LEAST_STEP, _NEAR = 12, 1e-3, (0.3, 0.05, 0.02)
+# Rounds of Gauss and Newton for each new three, the last of which moves no pose and no number by
+# more than this (with 4e-3 wrong lenses are told late). Each linearizes one three anew: that of
+# which poses, or shared numbers in units of the last, have moved most.
+_ROUNDS, _LEAST_STEP, _NEAR = 8, 1e-3, (0.3, 0.05, 0.02)
 _LEAST_NOISE = 0.1  # px, no real error is smaller
 # So many threes in a row that do not fit those before are no chance.
 _ODD = 2
@@ -64,16 +65,19 @@ _CUBIC, _OF_CHANGE, _LIKE_MOTION = (-2.0, 1.0, -2.0), 0.15, 0.002
 # the lens (principal point, px, and distortion at the corners, px); and of the map, over its
 # extent: bends and stretches (printed boards have 0.3 %).
 _READOUT, _LENGTH, _RATIO, _LENS, _MAP = 0, 1, 2, slice(3, 6), slice(6, 11)
-_ANY = (3.0, 1.0, 0.1)
+_ANY = (3.0, 0.5, 0.1)
 _BENT, _SHARED = 0.003, 11
 _OF_K = slice(_LENGTH, _RATIO + 1)
 # Landmarks farther away than this many extents are moved like those there.
 _FAR = 2.0
-# A focal length, and fy over fx, are others than K's beyond this many deviations, and may be so
-# beyond the second. The deviation of the focal length of this very camera has the third beside what
-# is declared: who calibrates a moving camera without its shutter is off by up to 2.8 % (twelve real
-# boards). No fy over fx is known better than to the last.
+# Focal length and fy over fx are others than K's beyond so many deviations. Beyond the second they
+# may be, and poses allow for that. The deviation of the focal length of this very camera has the
+# third beside what is declared: who calibrates a moving camera without its shutter is off by up to
+# 2.8 % (twelve real boards). No fy over fx is known better than to the last.
 _SURELY, _DOUBTFULLY, _USUAL, _EXACT = 4.0, 2.0, 0.01, 1e-4
+# Deviations are larger by this before K is denied: cameras that vibrate by 0.1 to 0.3 deg show
+# another focal length by up to 8.4 of them, or fy over fx by 11 (72 recordings).
+_VIBRATING = 3.0
 # If the readout time is off by more than this (logarithm), rows and images move otherwise, and
 # nothing is told of fy over fx.
 _TURNED = 0.25
@@ -102,14 +106,8 @@ class Matrix(NamedTuple):
     aspect_ratio: float  # fy over fx, over K's
 
     def __str__(self) -> str:
-        named = [
-            f"{name} {value:.3g} times K's"
-            for name, value in (
-                ("a focal length", self.focal_length),
-                ("fy over fx", self.aspect_ratio),
-            )
-            if value != 1.0
-        ]
+        names = zip(("a focal length", "fy over fx"), self, strict=True)
+        named = [f"{name} {value:.3g} times K's" for name, value in names if value != 1.0]
         return (
             f"successive images fit a camera with {' and '.join(named)}: is K that of another "
             "resolution or of a zoomed, squeezed or rectified image, was only its size edited, or "
@@ -186,23 +184,20 @@ class _Three:
         for each in posed:
             turn, place = each.found.rotation, each.found.position - map_.centre
             self.poses.append((turn, turn.T @ ((turn @ place) * [1.0, 1.0, math.exp(length)])))
+        turn, place = self.poses[1]
+        self.depth = abs(float(np.median((self.frames[1].seen.points - place) @ turn[2])))
+        self.known = self._known()  # of its own numbers beforehand, as information (25,)
         self.own = np.zeros(_OWN)  # that of the poses stays zero
         residuals = np.concatenate([each.found.residuals[each.found.inliers] for each in posed])
         self.variance = _variance(residuals**2)  # px^2, that each frame leaves alone
         self.equations: _Equations | None = None
 
-    @property
-    def depth(self) -> float:
-        """Median depth (m) of the points."""
-        turn, place = self.poses[1]
-        return abs(float(np.median((self.frames[1].seen.points - place) @ turn[2])))
-
-    def is_stale(self, numbers: Array) -> bool:
-        """Return whether the linear terms no longer hold at these shared numbers (11,)."""
-        if (there := self.equations) is None:
-            return True
-        near = np.abs((numbers - there.numbers)[:3]) < _NEAR
-        return not (near.all() and np.abs(there.step[:_STAMP]).max() < _LEAST_STEP)
+    def staleness(self, numbers: Array) -> float:
+        """Return how far shared numbers (11,) and poses are from where the linear terms hold."""
+        there = self.equations
+        assert there is not None
+        shared = np.abs((numbers - there.numbers)[:3]) / _NEAR
+        return float(max(shared.max(), np.abs(there.step[:_STAMP]).max() / _LEAST_STEP))
 
     def linearize(self, numbers: Array, principal: Array, least: float) -> None:
         """Linearize at these shared numbers (11,), where its own ones move to.
@@ -222,9 +217,8 @@ class _Three:
         rows, off = columns[near].reshape(-1, _OWN + _SHARED), errors[near].ravel()
         weighed = rows.T * weights
         every, slope = weighed @ rows, weighed @ off
-        known = self._known()
-        own = every[:_OWN, :_OWN] + np.diag(known)
-        crossed, pull = every[:_OWN, _OWN:], slope[:_OWN] + known * self.own
+        own = every[:_OWN, :_OWN] + np.diag(self.known)
+        crossed, pull = every[:_OWN, _OWN:], slope[:_OWN] + self.known * self.own
         gain = np.linalg.solve(own, np.column_stack([crossed, pull]))
         self.equations = _Equations(
             numbers,
@@ -236,7 +230,6 @@ class _Three:
         )
 
     def _known(self) -> Array:
-        """Return what is known of its own numbers beforehand, as information (25,)."""
         frame = self.frames[1]
         before, after = (
             self._way(1, other) / away
@@ -344,25 +337,27 @@ class FramesTogether:
         self._usual = np.array(usual)
         self._threes: list[_Three] = []
         self._map: _Landmarks | None = None
+        self._known = np.zeros(_SHARED)  # before any frame, as information
         self._principal, self._odd = np.zeros(2), 0
         self._fit: _Fit | None = None
         self.matrix: Matrix | None = None
         """The matrix that frames tell to be the camera's instead of K; None: K may be right."""
-        self.squeeze = 0.0
-        """Logarithm of fy over fx, over K's, if frames doubt it."""
+        self.doubt = np.zeros(2)
+        """Logarithms of focal length and fy over fx, over K's, as far as frames doubt K; else 0."""
 
     @property
     def is_enough(self) -> bool:
         """Whether further threes tell hardly more: soon no more than now."""
-        if self._fit is None or self._odd:
-            return True
-        return len(self._threes) == _KEPT or bool(self._fit.deviations[_LENGTH] < _KNOWN)
+        return self._fit is None or bool(self._fit.deviations[_LENGTH] < _KNOWN)
 
     @np.errstate(all="ignore")  # a start that leads nowhere
     def add(self, posed: Sequence[Fitted]) -> None:
         """Take three neighbours, in their order."""
         if self._map is None:
             self._map = _Landmarks.of(posed[0].points)
+            bent = math.hypot(_BENT, self._map_deviation / self._map.extent)
+            known = np.concatenate([_ANY, self._of_lens, np.full(_SHARED - _MAP.start, bent)])
+            self._known = np.maximum(known, _EXACT) ** -2.0
         before = np.zeros(_SHARED) if self._fit is None else self._fit.numbers
         newest = _Three(self._exposure, posed, self._map, before[_LENGTH])
         threes, principal = [*map(copy, self._threes), newest], self._principal
@@ -378,24 +373,22 @@ class FramesTogether:
         self._threes, self._fit, self._principal = threes, fit, principal
         if len(threes) > _KEPT:
             del self._threes[self._least()]
-        told = self._told(fit, _SURELY)
+        told = self._beyond(fit, _SURELY, _VIBRATING) > 0.0
         ratios = np.where(told, np.exp(fit.numbers[_OF_K]), 1.0)
         self.matrix = Matrix(*ratios.tolist()) if told.any() else None
-        self.squeeze = float(fit.numbers[_RATIO]) if self._told(fit, _DOUBTFULLY)[1] else 0.0
+        self.doubt = self._beyond(fit, _DOUBTFULLY)
 
-    def _told(self, fit: _Fit, least: float) -> Array:
-        """Return whether focal length and fy over fx (2,) are off by so many deviations."""
-        count = len(self._threes)
-        few = math.sqrt((count + 1.0) / max(count - 1.0, 0.5))  # may scatter little by chance
-        deviations = np.hypot(few * fit.deviations[_OF_K], self._usual)
-        told: Array = np.abs(fit.numbers[_OF_K]) > least * deviations
+    def _beyond(self, fit: _Fit, least: float, wider: float = 1.0) -> Array:
+        """Return what of focal length and fy over fx (2,) lies beyond so many deviations, or 0."""
+        deviations = np.hypot(wider * fit.deviations[_OF_K], self._usual)
+        squared = fit.numbers[_OF_K] ** 2 - (least * deviations) ** 2
         # Rows of a squeezed image take as long as before; images that are turned as wholes look
         # squeezed, too. Where rows seem to take another time than is given, a camera that vibrates
         # looks like another focal length.
         longer, aspect = math.log1p(max(fit.numbers[_READOUT], -0.9)), fit.numbers[_RATIO]
-        told[1] &= abs(longer + aspect) < _TURNED
-        told[0] &= abs(longer + aspect) < least * fit.deviations[_READOUT]
-        return told
+        most = np.array([least * fit.deviations[_READOUT], _TURNED])
+        beyond: Array = np.sqrt(np.maximum(squared, 0.0)) * (abs(longer + aspect) < most)
+        return beyond
 
     def _from_anywhere(self, posed: Sequence[Sequence[Fitted]]) -> tuple[_Fit, list[_Three], Array]:
         """Return a fit from other focal lengths, as each frame may hide what is wrong."""
@@ -415,7 +408,7 @@ class FramesTogether:
     def _fits(self, fit: _Fit, threes: Sequence[_Three]) -> bool:
         """Return whether no more is left than frames leave, and no lens or map is impossible."""
         own = float(np.median([three.variance for three in threes]))
-        squared = fit.numbers[_LENS.start :] ** 2 * self._known()[_LENS.start :]
+        squared = (fit.numbers**2 * self._known)[_LENS.start :]
         near = fit.variance < _AS_GOOD * max(own, self._least_variance(threes))
         return bool(near and squared.max() < _SURELY**2)
 
@@ -423,28 +416,17 @@ class FramesTogether:
         of_map = self._map_deviation * self._exposure.cameras[0].focal_length / threes[-1].depth
         return float(_LEAST_NOISE**2 + of_map**2)
 
-    def _known(self) -> Array:
-        """Return the information (11,) on shared numbers before any frame."""
-        assert self._map is not None
-        bent = math.hypot(_BENT, self._map_deviation / self._map.extent)
-        of_map = np.full(_MAP.stop - _MAP.start, bent)
-        deviations = np.concatenate([_ANY, self._of_lens, of_map])
-        known: Array = np.maximum(deviations, _EXACT) ** -2.0
-        return known
-
     def _fitted(self, threes: Sequence[_Three], start: Array, principal: Array) -> _Fit:
         """Return the fit of all threes, which move there."""
-        numbers, known, least = start, self._known(), self._least_variance(threes)
+        numbers, known, least = start, self._known, self._least_variance(threes)
         covariance: Array = np.diag(1.0 / known)
-        for _ in range(_ROUNDS):
-            stale = [three for three in threes if three.is_stale(numbers)]
-            for three in stale:
-                three.linearize(numbers, principal, least)
+        new = [three for three in threes if three.equations is None]
+        for three in new:
+            three.linearize(numbers, principal, least)
+        for _ in range(_ROUNDS * len(new)):
             information: Array = np.diag(known)
             slope = known * numbers
-            for three in threes:
-                there = three.equations
-                assert there is not None
+            for there in (three.equations for three in threes if three.equations):
                 information = information + there.information
                 slope = slope + there.slope + there.information @ (numbers - there.numbers)
             try:
@@ -456,7 +438,10 @@ class FramesTogether:
             if not math.isfinite(farthest):
                 break
             numbers = numbers + step * min(1.0, _MOST_STEP / farthest)
-            if farthest < _LEAST_STEP and not stale:
+            stalest = max(threes, key=partial(_Three.staleness, numbers=numbers))
+            if stalest.staleness(numbers) > 1.0:
+                stalest.linearize(numbers, principal, least)
+            elif farthest < _LEAST_STEP:
                 break
         linear = [three.equations for three in threes if three.equations]
         squared = [there.squared_errors for there in linear]
@@ -468,7 +453,7 @@ class FramesTogether:
     def _least(self) -> int:
         """Return the three without which the focal length is known best."""
         every = [three.equations.information for three in self._threes if three.equations]
-        total = np.diag(self._known()) + sum(every)
+        total = np.diag(self._known) + sum(every)
         without = [np.linalg.inv(total - one)[_LENGTH, _LENGTH] for one in every]
         return int(np.argmin(without))
 

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The derivatives of three frames together are those of finite differences."""
+"""Three frames together: their derivatives, and whether threes agree."""
 
 from copy import copy
 
@@ -48,3 +48,24 @@ def test_derivatives_are_finite_differences(k):
         expected = (lines(unit)[0] - lines(-unit)[0]) / 2e-5
         scale = np.abs(expected).max()
         np.testing.assert_allclose(columns[:, :, j], expected, atol=most[j] * scale, err_msg=str(j))
+
+
+def test_threes_scatter_as_much_as_their_equations_say_or_deviations_grow():
+    """Of threes that know shared numbers to 1 %, and show them elsewhere by so many times that."""
+    rng, nothing, known = np.random.default_rng(1), np.zeros(25), np.zeros((11, 11))
+    known[:3, :3] = 1e4 * np.eye(3)
+
+    def disagreement(times: float, count: int = 8) -> float:
+        shown = times * 0.01 * rng.normal(size=(count, 3))
+        shown -= shown.mean(axis=0)  # about their mean
+        threes = [
+            together._Equations(
+                np.zeros(11), known, known @ np.r_[each, np.zeros(8)], nothing, known, nothing
+            )
+            for each in shown
+        ]
+        return together._disagreement(threes, np.zeros(11))
+
+    assert disagreement(100.0, count=1) == disagreement(0.3) == 1.0
+    many = [disagreement(5.0) for _ in range(100)]
+    assert np.sqrt(np.mean(np.square(many))) == pytest.approx(5.0, rel=0.1)
