@@ -278,7 +278,7 @@ def moved_part(looks: Sequence[Look], map_deviation: float) -> MovedPart | None:
 
 
 def _beside(frames: _Frames, kept: BoolArray, declared: bool) -> _Beside:
-    """Eliminate motions and smooth errors of the points (f,m) that are kept.
+    """Return what motions and smooth errors take up of the points (f,m) that are kept.
 
     ``declared``: smooth errors are as large as is declared, and not as without a part.
     """
