@@ -215,7 +215,7 @@ class CameraFrames(FrameLocalizer):
             )
         if not published:
             matches = cloud.points, cloud.pixels, what_fits.ids_of(cloud)
-            published = self._explained(
+            published = self._mistakes.explained(
                 published, lambda: what_fits.what_fits(tracker.localizer, *matches)
             )
         return published

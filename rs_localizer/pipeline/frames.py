@@ -11,8 +11,7 @@ camera and a rig share stands here; ``CameraFrames`` and ``RigFrames`` localize.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -29,7 +28,6 @@ from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import CAMERA_INFO, MAP_POINTS
 from rs_localizer.io.transforms import Transforms, TransformTree
-from rs_localizer.pipeline import what_fits
 from rs_localizer.pipeline.aid import AidInput
 from rs_localizer.pipeline.cloud_checks import oddities
 from rs_localizer.pipeline.in_effect import in_effect, of_estimates
@@ -38,6 +36,7 @@ from rs_localizer.pipeline.pose_at_time import PublishedMoment, published_motion
 from rs_localizer.pipeline.published import is_mounting_late, of_body
 from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
 from rs_localizer.pipeline.stream import Stream
+from rs_localizer.pipeline.what_fits import Mistakes
 from rs_localizer.shutter_watch import ShutterWatch
 from rs_localizer.tracking import Tracker
 
@@ -119,7 +118,7 @@ class FrameLocalizer(ABC):
         self._tracker = self._new_tracker(config, cameras)
         self._cameras, self._config = cameras, config
         self._forget_frames()
-        self._mistakes = what_fits.Mistakes()
+        self._mistakes = Mistakes(self._notice)
 
     @property
     def calibration(self) -> Calibration | None:
@@ -266,15 +265,3 @@ class FrameLocalizer(ABC):
         for notice, text in odd.items():
             self._notice(notice, f"{name}: {text}" if name else text)
         return thin_cloud(cloud, most, camera.size)
-
-    def _explained(
-        self, refusal: Refusal, tried: Callable[[], str], notice: Notice = Notice.WOULD_FIT
-    ) -> Refusal:
-        """Return the refusal of a frame, with what would fit if something was found."""
-        if refusal.reason not in what_fits.REASONS:
-            return refusal
-        said = self._mistakes.explain_frame(tried)
-        if not said:
-            return refusal
-        self._notice(notice, said)
-        return replace(refusal, detail=f"{refusal.detail}; {said}")

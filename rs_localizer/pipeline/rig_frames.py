@@ -316,7 +316,7 @@ class RigFrames(FrameLocalizer):
         if not result:
             refusal = Refusal(result.reason, result.detail)
             localizer = self._tracker.localizer
-            return self._explained(
+            return self._mistakes.explained(
                 refusal,
                 lambda: what_fits.cameras_apart(localizer, matches, starts),
                 Notice.EXTRINSICS,

@@ -9,15 +9,17 @@ found; residuals alone do not show it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.reasons import Reason
+from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.localizer import Localizer
+from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
 
 REASONS = frozenset({
     Reason.TOO_FEW_POINTS, Reason.NO_HYPOTHESIS, Reason.TOO_FEW_INLIERS, Reason.BEHIND_CAMERA,
@@ -154,9 +156,14 @@ def ids_of(cloud: Correspondences) -> IntArray | None:
 
 
 class Mistakes:
-    """Looks for a mistake in refused frames, now and then."""
+    """Looks for a mistake in refused frames, now and then.
 
-    def __init__(self) -> None:
+    Args:
+        notice: told what was found.
+    """
+
+    def __init__(self, notice: Notify = unheard) -> None:
+        self._notice = notice
         self._refused, self._next = 0, 1
         self._agreed, self._said = 0, ""
 
@@ -173,3 +180,13 @@ class Mistakes:
             self._next = self._refused + 1 if said else _RARER * self._refused
             self._said = said
         return self._said if self._agreed >= _AGREED else ""
+
+    def explained(
+        self, refusal: Refusal, tried: Callable[[], str], notice: Notice = Notice.WOULD_FIT
+    ) -> Refusal:
+        """Return the refusal of a frame, with what would fit if something was found."""
+        said = self.explain_frame(tried) if refusal.reason in REASONS else ""
+        if not said:
+            return refusal
+        self._notice(notice, said)
+        return replace(refusal, detail=f"{refusal.detail}; {said}")
