@@ -23,8 +23,7 @@ VENV ?= .venv
 OUT ?= out
 # What `make jit` runs: tests that call kernels.
 JIT ?= test/core test/solvers test/estimation test/inertial test/matching test/markers test/native \
-    test/tools/adjust/test_factors.py test/tools/adjust/test_spline.py \
-    test/tools/simulation/test_rendering.py
+    test/tools/adjust/test_factors.py test/tools/simulation/test_rendering.py
 COVERAGE ?= --cov
 
 # The first interpreter that will do; without any, python3 is refused below with the reason.

@@ -1,6 +1,7 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Refining maps: against dense algebra, and against the truth of an own projector."""
+"""Refining maps: against dense algebra, and against the truth of an own projector; which shutter
+images show where nobody knows it."""
 
 from dataclasses import replace
 
@@ -16,7 +17,8 @@ from rs_localizer.tools.adjust.system import Factored
 from rs_localizer.tools.adjust.variables import Freedom, Unknowns
 from rs_localizer.tools.mapping.gauge import through
 from rs_localizer.tools.mapping.map_keypoints import MapFreedom, MapObservations
-from rs_localizer.tools.mapping.refinement import DRIFT, RefinedMap, Refinement, refine
+from rs_localizer.tools.mapping.refinement import DRIFT, RefinedMap, Refinement, fit_shutter, refine
+from rs_localizer.tools.readout_belief import ShutterFit
 
 VIDEO = np.arange(0.0, 1.2, 1.0 / 30.0)
 
@@ -160,3 +162,34 @@ def test_step_and_covariances_are_those_of_the_dense_system():
         np.testing.assert_allclose(covariance, inverse[at, at], rtol=1e-5, atol=1e-12)
     at = slice(motion, kept)
     np.testing.assert_allclose(shared, inverse[at, at], rtol=1e-5, atol=1e-12)
+
+
+def fit(readout: float) -> tuple[RefinedMap, ShutterFit | None]:
+    scene = walk(np.random.default_rng(1), VIDEO, points=100, count=40, readout=readout)
+    return fit_shutter(camera(0.0), scene.seen, scene.start, MapFreedom(), lambda text: None)
+
+
+def test_a_rolling_shutter_is_found():
+    refined, shutter = fit(READOUT)
+    assert shutter.visible
+    assert shutter.direction == ScanDirection.TOP_TO_BOTTOM
+    assert refined.readout_time == pytest.approx(READOUT, abs=4.0 * shutter.deviation)
+    assert shutter.deviation < 1e-3
+
+
+def test_a_global_shutter_is_left_alone():
+    refined, shutter = fit(0.0)
+    assert not shutter.visible
+    assert refined.readout_time == 0.0
+
+
+def test_images_that_no_smooth_motion_joins_have_poses_of_their_own():
+    """As those of a time lapse, whose stamps are nearer than its images were, some by much."""
+    scene = walk(np.random.default_rng(1), np.arange(0.0, 12.0, 1.0), readout=0.0)
+    stamps = scene.seen.stamps_ns[0] + np.cumsum(np.tile([5, 50, 50], 4)) * 10**6
+    seen = replace(scene.seen, stamps_ns=stamps)
+    refined, shutter = fit_shutter(camera(0.0), seen, scene.start, MapFreedom(), lambda text: None)
+    assert shutter is None
+    assert refined.apart
+    assert refined.fit_share > 0.95
+    assert refined.deviation == pytest.approx(0.3, rel=0.15)
