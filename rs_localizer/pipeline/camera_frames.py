@@ -213,12 +213,12 @@ class CameraFrames(FrameLocalizer):
                 "the pixels are those of the last image, bit for bit, and nothing says that the "
                 "camera moves: it counts once",
             )
-        if not published:
-            matches = cloud.points, cloud.pixels, what_fits.ids_of(cloud)
-            published = self._mistakes.explained(
-                published, lambda: what_fits.what_fits(tracker.localizer, *matches)
-            )
-        return published
+        return self._mistakes.explained(
+            published,
+            lambda: what_fits.what_fits(
+                tracker.localizer, cloud.points, cloud.pixels, what_fits.ids_of(cloud)
+            ),
+        )
 
     def _expect(self, time_ns: int, map_frame: str) -> None:
         """Tell the tracker what others know of the pose at a time, if it knows nothing itself."""

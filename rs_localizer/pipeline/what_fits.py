@@ -1,9 +1,10 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Frames that are refused for a mistake of their sender in pixels or corners.
+"""Frames that do not fit for a mistake of their sender in pixels or corners.
 
 Each known mistake is undone on the points of the frame. If the frame fits then, the mistake is
-found; residuals alone do not show it.
+found; residuals alone do not show it. Some such frames have a pose: of a mirrored room, one wall
+fits as it is seen from behind.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.io.clouds import Correspondences
+from rs_localizer.io.outputs import Localized
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
 
@@ -29,6 +31,8 @@ REASONS = frozenset({
 
 # Least share of inliers: a fault that all points share leaves only the outliers of any frame.
 _MOST = 0.7
+# A pose that explains less than this share of the points is in doubt, too.
+_HALF = 0.5
 # Single frames are refused for many reasons: one in a growing number of times more is tried, so
 # that a day of refusals costs some ten tries.
 _RARER = 4
@@ -182,11 +186,20 @@ class Mistakes:
         return self._said if self._agreed >= _AGREED else ""
 
     def explained(
-        self, refusal: Refusal, tried: Callable[[], str], notice: Notice = Notice.WOULD_FIT
-    ) -> Refusal:
-        """Return the refusal of a frame, with what would fit if something was found."""
-        said = self.explain_frame(tried) if refusal.reason in REASONS else ""
+        self, result: Localized | Refusal, tried: Callable[[], str],
+        notice: Notice = Notice.WOULD_FIT,
+    ) -> Localized | Refusal:  # fmt: skip
+        """Return what became of a frame, with what would fit if something was found.
+
+        A pose that explains less than half of the points is refused for what fits them.
+        """
+        if result and np.mean(result.estimate.inliers) >= _HALF:
+            self._agreed = 0
+            return result
+        said = self.explain_frame(tried) if result or result.reason in REASONS else ""
         if not said:
-            return refusal
+            return result
         self._notice(notice, said)
-        return replace(refusal, detail=f"{refusal.detail}; {said}")
+        if result:
+            return Refusal(Reason.CALIBRATION, said)
+        return replace(result, detail=f"{result.detail}; {said}")
