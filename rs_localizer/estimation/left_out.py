@@ -374,9 +374,11 @@ def _by_chance(observed: Observed, posterior: Posterior, wide: bool) -> Failure 
     Other mismatches lie anywhere; these may be a camera's that vibrates, or those of a rough map.
     """
     errors, inliers = posterior.squared_errors, posterior.inliers
-    circle = (GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length) ** 2
-    near, found = int(np.count_nonzero(errors < circle)), int(np.count_nonzero(inliers))
-    chance = min(float(errors[inliers].max()) / circle, 1.0)
+    # Of a rough map, or a short focal length, the gate may be as wide: others need room beside it.
+    gate = float(errors[inliers].max())
+    circle = max((GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length) ** 2, 4.0 * gate)
+    near, found = int(np.count_nonzero(errors <= circle)), int(np.count_nonzero(inliers))
+    chance = gate / circle
     if not wide and near <= found + _MARKER:
         return None
     # What fills a gate may be vibration, of which one readout tells as many numbers again.

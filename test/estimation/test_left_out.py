@@ -122,6 +122,21 @@ def test_noise_beyond_the_gate_is_learnt_and_named():
         assert off @ np.linalg.solve(result.covariance[:3, :3], off) < 16.0
 
 
+@pytest.mark.parametrize("focal_length", [60.0, 130.0, 260.0])
+def test_noise_as_wide_as_rays_of_a_wide_lens_are(focal_length):
+    """All points fit, so nothing was chosen: no chance made them fit."""
+    rng, k = np.random.default_rng(0), np.diag([focal_length, focal_length, 1.0])
+    k[:2, 2] = 319.5, 239.5
+    for _ in range(3):
+        pixels, depth = rng.uniform([0, 0], [639, 479], (100, 2)), rng.uniform(2.0, 4.0, (100, 1))
+        points = np.column_stack([(pixels - k[:2, 2]) / focal_length * depth, depth])
+        noisy = pixels + rng.normal(0.0, 5.0, pixels.shape)
+        result = rsl.Localizer(rsl.Camera(640, 480, k, readout_time=0.03)).localize(points, noisy)
+        assert result, result
+        off = np.r_[Rotation.from_matrix(result.rotation).as_rotvec(), result.translation]
+        assert off @ np.linalg.solve(result.covariance[:6, :6], off) < 22.5  # 99.9 %
+
+
 def test_points_that_fit_by_chance_are_no_motion():
     random = np.random.default_rng(8)
     for _ in range(6):
