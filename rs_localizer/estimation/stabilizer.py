@@ -36,7 +36,7 @@ class RowRotation(NamedTuple):
 
 
 class RowRotations:
-    """Those of the last frames."""
+    """The rotations of the last frames beside those between images, compared."""
 
     def __init__(self) -> None:
         self._last: deque[RowRotation] = deque(maxlen=_LAST)
