@@ -103,10 +103,9 @@ class LensWatch:
     def widened(self, found: Estimate, points: Array) -> Estimate:
         """Return a frame whose velocities allow for another camera matrix, if frames doubt K.
 
-        Before a board that is farther away by a share, ways are longer by it, and what turns the
-        camera and what moves it across are told apart as badly as its tilt. A camera whose fy over
-        fx is off by ``s`` reads that as a pitch rate of ``s`` times the height over the focal
-        length.
+        A wrong focal length scales the distance of a board, its tilt and all ways by one share, and
+        so it does linear and angular velocities. A camera whose fy over fx is off by ``s`` reads
+        that as a pitch rate of ``s`` times the height over the focal length.
         """
         if self._exposure is None or self._together is None or not self._together.doubt.any():
             return found
