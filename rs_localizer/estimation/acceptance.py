@@ -27,7 +27,7 @@ from rs_localizer.core.state import (
     rotation_of,
 )
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation.calibration import CalibrationEffect, promised
+from rs_localizer.estimation.calibration import CalibrationEffect, longest_axis, promised
 from rs_localizer.estimation.gaussian import along_arcs
 from rs_localizer.estimation.hypotheses import Posterior
 from rs_localizer.estimation.known_rotation import with_turn
@@ -229,7 +229,7 @@ def estimate_of(
     rate, change = state[STATE_ANGULAR], state[STATE_ANGULAR_ACCELERATION]
     covariance = posterior.covariance
     # The noise of this frame is an estimate, and what is on an arc leaves its tangent.
-    motion, arched = covariance[:PARAMETERS, :PARAMETERS], posterior.arched
+    motion, arched = covariance[:PARAMETERS, :PARAMETERS].copy(), posterior.arched
     if arched is None:
         alone = np.zeros((1, PARAMETERS)), motion[None]
         arched = along_arcs(motion, state[STATE_TRANSLATION], np.ones(1), *alone)
@@ -273,7 +273,7 @@ def _knows_velocities(posterior: Posterior) -> bool:
         return True
     velocities = posterior.state[POSE_SIZE:]
     return all(
-        np.linalg.eigvalsh(posterior.covariance[part, part])[-1]
-        < (_TOLD * np.linalg.norm(velocities[part.start - POSE.stop :][:3])) ** 2
+        longest_axis(posterior.covariance[part, part].copy())
+        < _TOLD * math.hypot(*velocities[part.start - POSE.stop :][:3].tolist())
         for part in (ANGULAR, LINEAR)
     )

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.config import CalibrationErrors
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, Array1, Array2
 from rs_localizer.core.bearings import pinhole, radial_slopes
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import by_lens, coefficients_of, corner_of
@@ -33,7 +33,8 @@ from rs_localizer.estimation.moved_part import MovedPart
 from rs_localizer.estimation.points import Observed, rays_of_lens
 from rs_localizer.estimation.prior import SPEEDS, PriorTerms, terms_at
 from rs_localizer.estimation.projection import linearized
-from rs_localizer.estimation.robust import inverted
+from rs_localizer.estimation.robust import eliminate, inverted
+from rs_localizer.native import entry
 
 # Of each camera: centre (2), focal length, distortion, fy over fx.
 _ERRORS = 5
@@ -43,6 +44,8 @@ _CONFIGURED = np.array([speed == 1.0 for speed in SPEEDS], float)
 # fy over fx changes as each changes by a half, the other way.
 _ASPECT = np.array([-0.5, 0.5])
 
+# More points than this only take time: sums over all of them are as well known.
+_MANY = 250
 # Points this near (m) to a landmark are that landmark, in single precision as far as 8 km.
 _SAME = 0.001
 # A direction to sort landmarks by: no wall, floor or row of them is across it.
@@ -107,16 +110,17 @@ def calibration_effect(
             the smooth error does.
         part: of the map that is elsewhere; what it leaves of the points nobody has declared.
     """
-    observations, chosen = observed.observations, posterior.inliers
-    exposure = observed.exposure
-    tau = observations.tau
-    lines = linearized(
-        observations.packed, len(tau), posterior.state, shake_at(tau, posterior.shake)
-    )
-    by_motion, image, tau = lines.by_motion[chosen], lines.image[chosen], tau[chosen]
+    observations, chosen = observed.observations, np.flatnonzero(posterior.inliers)
+    exposure, found = observed.exposure, len(chosen)
+    if found > _MANY:
+        chosen = chosen[np.linspace(0, found - 1, _MANY).astype(np.int64)]
+    some = observations.only(chosen)
+    state, tau = posterior.state, some.tau
+    lines = linearized(some.packed, some.count, state, shake_at(tau, posterior.shake))
+    by_motion, image = lines.by_motion, lines.image
     rotation = observed.rotation
     rays = image if rotation is None else rays_of_lens(rotation, tau, image)
-    of_side = observations.camera[chosen]
+    of_side = some.camera
     columns = np.zeros((len(rays), 2, _ERRORS * len(exposure.cameras)))
     for place, side in enumerate(exposure.sides):
         here, first = of_side == place, _ERRORS * side.place
@@ -132,44 +136,63 @@ def calibration_effect(
         declared += modes[0].shape[2] if of_map is not None else 0
         # A camera that moves as the point does would move it the other way: of a deviation either
         # sign will do.
-        by_point = by_motion[:, :, MOVE] @ rotation_of(posterior.state)
+        by_point = by_motion[:, :, MOVE] @ rotation_of(state)
         columns = np.concatenate([columns, by_point @ np.concatenate(modes, axis=2)], axis=2)
     bend = posterior.bend[chosen] if posterior.bend.shape[1] else np.zeros((len(rays), 0))
     of_speeds = posterior.speeds if len(posterior.speeds) else _CONFIGURED
     smooth = posterior.shared * smooth_columns(by_motion, image, bend)
-    variance, fitted = posterior.noise**2, PARAMETERS + smooth.shape[2]
-    rows = np.concatenate([by_motion, smooth, columns], axis=2).reshape(2 * len(rays), -1)
-    every = rows.T @ rows
-    still, of_pose = math.inf, inverted(every[POSE, POSE].copy())
+    rows = np.concatenate([smooth, by_motion, columns], axis=2).reshape(2 * len(rays), -1)
+    every = found / len(rays) * (rows.T @ rows)
+    variance, first = posterior.noise**2, smooth.shape[2]
+    still, of_pose = math.inf, inverted(every[first:, first:][POSE, POSE].copy())
     if math.isfinite(of_pose[0, 0]):
-        still = longest_axis(posterior.inflation * variance * of_pose)
-    motion, crossed = slice(0, PARAMETERS), every[:fitted, fitted:]
-    of_motion, of_errors = every[motion, motion], crossed[motion]
-    if tracked:  # else the covariance has what the smooth error does
-        crossed = np.hstack([crossed, variance * np.eye(fitted)[:, PARAMETERS:]])
-    # The smooth error is taken out, for all speeds.
-    beside = every[PARAMETERS:fitted, :PARAMETERS]
-    own = every[PARAMETERS:fitted, PARAMETERS:fitted] + variance * np.eye(fitted - PARAMETERS)
-    explained = np.linalg.solve(own, beside).T
-    information, crossed = (
-        of_motion - explained @ beside,
-        crossed[motion] - explained @ crossed[PARAMETERS:],
+        still = longest_axis(posterior.inflation * variance * of_pose[TURN, TURN].copy())
+    # Without other frames the covariance has all of what the smooth error does.
+    covariance, left = _effect(
+        every, (first, tracked), of_speeds, terms, state, variance, rotation is not None
     )
-    inverses = np.zeros((2, PARAMETERS, PARAMETERS))  # with and without the smooth error
-    for speed, part in zip(SPEEDS, of_speeds.tolist(), strict=True):
-        if part > _NO_PART:
-            of_speed = terms_at(terms, speed, rotation is not None)
-            prior = variance * known_at(of_speed, posterior.state).form[motion, motion]
-            inverses[0] += part * inverted(information + prior)
-            inverses[1] += part * inverted(of_motion + prior)
-    if not np.isfinite(inverses).all():
+    if not np.isfinite(covariance).all():
         return NO_EFFECT._replace(still_deviation=still)
-    pull, taken = inverses[0, :MOTION_PARAMETERS] @ crossed, inverses[1] @ of_errors
-    # What no motion takes up.
+    residual = math.sqrt(max(float(left[:declared].sum()), 0.0) / (2.0 * found))
+    return CalibrationEffect(covariance, residual, still)
+
+
+@entry
+def _effect(
+    every: Array2, fitted: tuple[int, bool], of_speeds: Array1, terms: PriorTerms, state: Array1,
+    variance: float, turn_known: bool,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Return what errors of one deviation do to pose and velocities, and what they leave.
+
+    Args:
+        every: (q+18+k,q+18+k) products of the columns of smooth error, motion, and errors.
+        fitted: how many columns the smooth error has; and whether it does something beside the
+            covariance, too.
+        of_speeds: probabilities of typical speeds.
+
+    Returns:
+        covariance (12,12) and what no motion takes up (k,), px^2; NaN: nothing is determined.
+    """
+    smooth, is_beside = fitted
+    size, last = len(every), smooth + PARAMETERS
+    whole = np.zeros((size + smooth, size + smooth))
+    whole[:size, :size] = every
+    for k in range(smooth):
+        whole[k, k] += variance
+        whole[k, size + k] = variance if is_beside else 0.0
+    eliminate(whole, smooth)  # for all speeds
+    beside, alone = np.zeros((PARAMETERS, PARAMETERS)), np.zeros((PARAMETERS, PARAMETERS))
+    for k in range(len(of_speeds)):
+        if of_speeds[k] > _NO_PART:
+            known = known_at(terms_at(terms, SPEEDS[k], turn_known), state)
+            prior = variance * known.form[:PARAMETERS, :PARAMETERS]
+            beside += of_speeds[k] * inverted(whole[smooth:last, smooth:last] + prior)
+            alone += of_speeds[k] * inverted(every[smooth:last, smooth:last] + prior)
+    pull = beside[:MOTION_PARAMETERS] @ whole[smooth:last, last:].copy()
+    of_motion, of_errors = every[smooth:last, smooth:last].copy(), every[smooth:last, last:].copy()
+    taken = alone @ of_errors
     left = np.sum(taken * (of_motion @ taken - 2.0 * of_errors), axis=0)
-    left = (left + np.diagonal(every)[fitted:])[:declared].sum()
-    residual = math.sqrt(max(float(left), 0.0) / max(len(rows), 1))
-    return CalibrationEffect(pull @ pull.T, residual, still)
+    return pull @ pull.T, left + np.diag(every)[last:]
 
 
 def promised(posterior: Posterior) -> float:
@@ -209,6 +232,7 @@ def _columns(camera: Camera, towards: Array, deviation: CalibrationErrors) -> Ar
     return columns
 
 
-def longest_axis(covariance: Array) -> float:
-    """Return the deviation (rad) of the rotation about the axis that is known worst."""
-    return math.sqrt(np.linalg.eigvalsh(covariance[TURN, TURN])[-1])
+@entry
+def longest_axis(covariance: Array2) -> float:
+    """Return the deviation (rad) of the rotation (3,3) about the axis that is known worst."""
+    return math.sqrt(max(np.linalg.eigh(covariance)[0][-1], 0.0))

@@ -26,16 +26,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray1, IntArray
-from rs_localizer.core.so3 import exp, hat
-from rs_localizer.core.state import (
-    MOVE,
-    PARAMETERS,
-    STATE_SIZE,
-    STATE_TRANSLATION,
-    TURN,
-    step_between,
-)
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3, BoolArray1, IntArray
+from rs_localizer.core.so3 import exp, hat_of
+from rs_localizer.core.state import PARAMETERS, STATE_SIZE, TURN, step_between
 from rs_localizer.estimation.linear_fit import (
     NO_TURN,
     Linear,
@@ -52,17 +45,6 @@ from rs_localizer.estimation.prior import PriorTerms, offset_between
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.robust import TINY, apply_step
 from rs_localizer.native import entry, inlined, kernel
-
-# Of y = (phi, d): d = -rho + [p]x phi by p; the forms of -phi x d, and of -phi x (phi x p) / 2 =
-# (p (phi . phi) - phi (phi . p)) / 2 by p.
-_BY_STEP, _BY_CENTRE = np.diag(np.repeat([1.0, -1.0], 3)), np.zeros((3, 6, 6))
-_CROSSES, _TWICE_CROSSED = np.zeros((3, 6, 6)), np.zeros((3, 3, 6, 6))
-_UNIT = np.eye(3)
-_BY_CENTRE[:, MOVE, TURN] = hat(_UNIT)
-_CROSSES[:, TURN, MOVE], _CROSSES[:, MOVE, TURN] = 0.5 * hat(_UNIT), -0.5 * hat(_UNIT)
-_SQUARES = 0.5 * _UNIT[:, :, None, None] * _UNIT
-_OUTER = _UNIT[None, :, :, None] * _UNIT[:, None, None]  # p_c phi_i phi_c
-_TWICE_CROSSED[:, :, TURN, TURN] = _SQUARES - 0.25 * (_OUTER + _OUTER.transpose(0, 1, 3, 2))
 
 # Linearizations of a mode, at most; and the last one is where the step to the optimum leaves its
 # tangent by less than this part of the noise.
@@ -91,10 +73,10 @@ class Gaussians(NamedTuple):
     Behind the 18 numbers of a step covariances may have those of an in-frame turn.
     """
 
-    states: Array  # (k,24)
-    turns: Array  # (k,t) coefficients of the in-frame turn
-    covariances: Array  # (k,18 + t,18 + t)
-    evidences: Array  # (k,) logarithms
+    states: Array2  # (k,24)
+    turns: Array2  # (k,t) coefficients of the in-frame turn
+    covariances: Array3  # (k,18 + t,18 + t)
+    evidences: Array1  # (k,) logarithms
 
 
 class Mixture(NamedTuple):
@@ -110,65 +92,55 @@ class Mixture(NamedTuple):
     covariances: Array  # (k,18,18) of the offsets
 
 
-def weights_of(logarithms: Array) -> Array:
+@entry
+def weights_of(logarithms: Array1) -> Array:
     """Return the probabilities (k,) with these logarithms, up to a constant."""
-    weights = np.exp(logarithms - logarithms.max())
-    found: Array = weights / weights.sum()
-    return found
+    weights = np.exp(logarithms - np.max(logarithms))
+    weights /= np.sum(weights)
+    return weights
 
 
-def mixture(parts: Gaussians, preferences: Array, temper: float) -> Mixture:
+@entry
+def mixture(parts: Gaussians, preferences: Array1, temper: float) -> Mixture:
     """Return the mixture of Gaussians, with the mean by their probabilities, second moments
     about it by probabilities to the power of ``temper``.
 
     Args:
         preferences: (k,) logarithms of odds that count in the mean alone.
     """
-    if len(parts.states) == 1:
-        one = parts.covariances[0]
-        return Mixture(
-            parts.states[0], parts.turns[0], one, float(parts.evidences[0]), np.ones(1), np.ones(1),
-            np.zeros((1, PARAMETERS)), one[None, :PARAMETERS, :PARAMETERS],
-        )  # fmt: skip
+    count, size = len(parts.states), parts.covariances.shape[1]
     probable = weights_of(parts.evidences + preferences)
-    possible = weights_of(temper * parts.evidences)
-    top = parts.evidences.max()
-    evidence = float(top + np.log(np.exp(parts.evidences - top).sum()))
-    best = int(probable.argmax())
-    first, turn = parts.states[best], probable @ parts.turns
-    pivot = first[STATE_TRANSLATION]
-    steps, _ = _offsets_between(first, parts.states, pivot)
-    mean = probable @ steps
+    possible, top = weights_of(temper * parts.evidences), np.max(parts.evidences)
+    evidence = top + math.log(np.sum(np.exp(parts.evidences - top)))
+    first = parts.states[np.argmax(probable)].copy()
+    pivot, mean, turn = first[9:12].copy(), np.zeros(PARAMETERS), np.zeros(size - PARAMETERS)
+    for k in range(count):
+        step, _ = offset_between(first, parts.states[k], pivot)
+        mean += probable[k] * step
+        turn += probable[k] * parts.turns[k]
     state = apply_step(first, mean)
     # About the pivot, which the move of a step is not.
-    state[STATE_TRANSLATION] = pivot - mean[MOVE] + hat(pivot) @ mean[TURN]
-    pivot = state[STATE_TRANSLATION].copy()
-    offsets, by_turns = _offsets_between(state, parts.states, pivot)
-    # Covariances of steps as those of offsets, which go with the turn.
-    by_step = np.zeros((len(by_turns), 6, 6))
-    by_step[:, :, :3], by_step[:, 3:, 3:] = by_turns, np.eye(3)
-    about = parts.covariances.copy()
-    about[:, :6] = by_step @ about[:, :6]
-    about[:, :, :6] = about[:, :, :6] @ by_step.transpose(0, 2, 1)
-    away = np.hstack([offsets, parts.turns - turn])
-    covariance = (possible @ about.reshape(len(possible), -1)).reshape(about.shape[1:])
-    covariance += (possible * away.T) @ away
-    about = about[:, :PARAMETERS, :PARAMETERS]
-    return Mixture(state, turn, covariance, evidence, probable, possible, offsets, about)
+    state[9:12] = pivot - mean[3:6] + hat_of(pivot) @ mean[:3]
+    pivot[:], by_step, away = state[9:12], np.eye(6), np.empty(size)
+    offsets, covariance = np.empty((count, PARAMETERS)), np.zeros((size, size))
+    covariances = np.empty((count, PARAMETERS, PARAMETERS))
+    for k in range(count):
+        offsets[k], by_step[:, :3] = offset_between(state, parts.states[k], pivot)
+        away[:PARAMETERS], away[PARAMETERS:] = offsets[k], parts.turns[k] - turn
+        # Covariances of steps as those of offsets, which go with the turn.
+        about = parts.covariances[k].copy()
+        about[:6] = by_step @ about[:6]
+        about[:, :6] = about[:, :6].copy() @ by_step.T
+        covariances[k] = about[:PARAMETERS, :PARAMETERS]
+        for i in range(size):
+            for j in range(size):
+                covariance[i, j] += possible[k] * (about[i, j] + away[i] * away[j])
+    return Mixture(state, turn, covariance, evidence, probable, possible, offsets, covariances)
 
 
 @entry
-def _offsets_between(reference: Array1, states: Array2, pivot: Array1) -> tuple[Array, Array]:
-    """Return :func:`offset_between` of states (k,24): offsets (k,18), derivatives (k,6,3)."""
-    count = len(states)
-    offsets, by_turns = np.empty((count, PARAMETERS)), np.empty((count, 6, 3))
-    for k in range(count):
-        offsets[k], by_turns[k] = offset_between(reference, states[k], pivot)
-    return offsets, by_turns
-
-
 def along_arcs(
-    covariance: Array, centre: Array, weights: Array, offsets: Array, covariances: Array
+    covariance: Array2, centre: Array1, weights: Array1, offsets: Array2, covariances: Array3
 ) -> Array:
     """Return the covariance to second order in the move; the rotation has no second order.
 
@@ -186,22 +158,35 @@ def along_arcs(
         offsets: (k,18) of their means (:func:`offset_between`).
         covariances: (k,18,18) of the offsets.
     """
-    # y = (phi, d): d = -rho + [p]x phi.
-    by_step = _BY_STEP + (centre @ _BY_CENTRE.reshape(3, -1)).reshape(6, 6)
-    forms = _CROSSES + (centre @ _TWICE_CROSSED.reshape(3, -1)).reshape(3, 6, 6)
-    count = len(weights)
-    means, crossed = offsets[:, :6] @ by_step.T, covariances[:, :, :6] @ by_step.T
-    both = by_step @ crossed[:, :6]
-    products, pulls = forms @ both[:, None], (forms @ means[:, None, :, None])[..., 0]
-    size = np.trace(products, axis1=2, axis2=3) + (pulls @ means[:, :, None])[..., 0]
-    second = size[:, :, None] * size[:, None] + 4.0 * pulls @ both @ pulls.transpose(0, 2, 1)
-    crossings = products.transpose(0, 1, 3, 2).reshape(count, 3, 36).transpose(0, 2, 1)
-    second += 2.0 * products.reshape(count, 3, 36) @ crossings
-    first = size[:, :, None] * offsets[:, None] + 2.0 * pulls @ crossed.transpose(0, 2, 1)
-    farther, along = covariance.copy(), (weights @ first.reshape(count, -1)).reshape(3, -1)
-    farther[MOVE, MOVE] += (weights @ second.reshape(count, -1)).reshape(3, 3)
-    farther[MOVE] += along
-    farther[:, MOVE] += along.T
+    # y = (phi, d): d = -rho + [p]x phi, and the forms H_i.
+    by_step, forms = np.diag(np.repeat(np.array([1.0, -1.0]), 3)), np.zeros((3, 6, 6))
+    by_step[3:, :3] = hat_of(centre)
+    for i in range(3):  # -phi x d, and -phi x (phi x p) / 2 = (p (phi . phi) - phi (phi . p)) / 2
+        j, k = (i + 1) % 3, (i + 2) % 3
+        forms[i, j, 3 + k] = forms[i, 3 + k, j] = -0.5
+        forms[i, k, 3 + j] = forms[i, 3 + j, k] = 0.5
+        for axis in range(3):
+            forms[i, axis, axis] += 0.5 * centre[i]
+            forms[i, i, axis] -= 0.25 * centre[axis]
+            forms[i, axis, i] -= 0.25 * centre[axis]
+    farther, products = covariance.copy(), np.empty((3, 6, 6))
+    pulls, sizes = np.empty((3, 6)), np.empty(3)
+    for n in range(len(weights)):
+        mean, crossed = by_step @ offsets[n, :6], by_step @ covariances[n, :6]
+        both = crossed[:, :6].copy() @ by_step.T
+        for i in range(3):
+            products[i], pulls[i] = forms[i] @ both, forms[i] @ mean
+            sizes[i] = np.trace(products[i]) + np.sum(pulls[i] * mean)
+        told = pulls @ both @ pulls.T
+        along = 2.0 * pulls @ crossed
+        for i in range(3):
+            for j in range(3):
+                second = 4.0 * told[i, j] + 2.0 * np.sum(products[i] * products[j].T)
+                farther[3 + i, 3 + j] += weights[n] * (second + sizes[i] * sizes[j])
+            for k in range(PARAMETERS):
+                first = weights[n] * (along[i, k] + sizes[i] * offsets[n, k])
+                farther[3 + i, k] += first
+                farther[k, 3 + i] += first
     return farther
 
 
@@ -281,21 +266,24 @@ def _bent(step: Array, frame: Frame) -> float:
     return 0.5 * frame.focal_length * total * total
 
 
+@entry
 def over_leans(frame: Frame, mode: Mode, terms: PriorTerms) -> Mode:
     """Integrate the mode of a plane over its leans, if they are hardly known."""
-    if not np.isfinite(mode.covariance).all():  # so open that it cannot be computed
+    if not np.all(np.isfinite(mode.covariance)):  # so open that it cannot be computed
         return mode
-    held = frame._replace(
-        shared=frame.shared.at(mode.size), noise=frame.noise._replace(deviation=mode.noise)
-    )
-    states, covariances, evidences, whole = _leans(held, mode, terms)
-    if not (len(states) and np.isfinite(whole)):
+    shared, noise = frame.shared, frame.noise
+    held = Frame(
+        frame.data, frame.points, frame.chosen,
+        Shared(shared.rows, shared.squares, np.array([mode.size]), np.zeros(1)),
+        Noise(mode.noise, noise.correction, noise.decided), frame.focal_length, frame.depth,
+    )  # fmt: skip
+    parts, whole = _leans(held, mode, terms)
+    if not (len(parts.states) and np.isfinite(whole)):
         return mode
-    parts = Gaussians(states, np.zeros((len(states), 0)), covariances, evidences)
-    mixed = mixture(parts, np.zeros(len(states)), 1.0)
-    return mode._replace(
-        state=mixed.state, covariance=mixed.covariance,
-        evidence=mode.evidence + mixed.evidence - whole,
+    mixed = mixture(parts, np.zeros(len(parts.states)), 1.0)
+    return Mode(
+        mixed.state, mixed.covariance, mode.evidence + mixed.evidence - whole, mode.cost,
+        mode.noise, mode.size, mode.freedom,
     )  # fmt: skip
 
 
@@ -309,14 +297,13 @@ def _evidence_of(mode: Mode, least: float, freedom: float) -> float:
     return mode.evidence + 0.5 * (mode.cost - least - freedom * math.log1p(beyond))
 
 
-@entry
-def _leans(frame: Frame, mode: Mode, terms: PriorTerms) -> tuple[Array, Array, Array, float]:
+@kernel
+def _leans(frame: Frame, mode: Mode, terms: PriorTerms) -> tuple[Gaussians, float]:
     """Return Gaussians beside the leans of a grid, along the one or two axes that are hardly known.
     Noise, inliers and the size of the smooth error are taken from the mode.
 
     Returns:
-        states (k,24), covariances (k,18,18), evidences (k,), of nothing where the lean is known;
-        and that of the mode itself.
+        Gaussians, none where the lean is known; and the evidence of the mode itself.
     """
     rotation, count = mode.state[:9].copy().reshape(3, 3), len(terms.informations)
     plane, centre, normal = plane_of(frame.points, frame.chosen)
@@ -324,8 +311,8 @@ def _leans(frame: Frame, mode: Mode, terms: PriorTerms) -> tuple[Array, Array, A
     flat = np.eye(3) - normal * normal.reshape(3, 1)
     sizes, axes = np.linalg.eigh(flat @ mode.covariance[TURN, TURN].copy() @ flat)
     if not (plane and sizes[2] > _KNOWN_LEAN**2):
-        nothing = np.zeros((0, PARAMETERS, PARAMETERS))
-        return np.zeros((0, STATE_SIZE)), nothing, np.zeros(0), 0.0
+        nothing = np.zeros((0, STATE_SIZE)), np.zeros((0, 0)), np.zeros((0, PARAMETERS, PARAMETERS))
+        return Gaussians(*nothing, np.zeros(0)), 0.0
     # The mirrored lean may lie beyond others that are out of the question.
     _, twin = leaning_less(frame.points, frame.chosen, mode.state, 2.0)
     away = axes.T @ step_between(mode.state, twin)[TURN]
@@ -382,7 +369,8 @@ def _leans(frame: Frame, mode: Mode, terms: PriorTerms) -> tuple[Array, Array, A
         last = 0
     area = np.prod(steps / (_PIN * steps[used - 1] * math.sqrt(2.0 * math.pi)))
     evidences[:last] += math.log(area)
-    return states[:last], covariances[:last], evidences[:last], alone.evidence
+    turns = np.zeros((last, 0))
+    return Gaussians(states[:last], turns, covariances[:last], evidences[:last]), alone.evidence
 
 
 @inlined

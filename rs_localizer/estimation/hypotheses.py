@@ -18,7 +18,6 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.shake import COMBINATIONS, RESOLVED, shake_at
 from rs_localizer.core.state import (
     LINEAR,
-    MOTION_PARAMETERS,
     PARAMETERS,
     POSE,
     POSE_SIZE,
@@ -39,7 +38,6 @@ from rs_localizer.estimation.gaussian import (
 from rs_localizer.estimation.linear_fit import (
     IN_FUNCTIONS,
     MIDDLE,
-    NO_TURN,
     ORDINARY,
     TURNS,
     VIBRATION,
@@ -48,6 +46,7 @@ from rs_localizer.estimation.linear_fit import (
     bend_of,
     changed,
     fit,
+    hidden,
     known_at,
     linear_of,
     moved,
@@ -55,7 +54,6 @@ from rs_localizer.estimation.linear_fit import (
     of_changed,
     smooth_error,
     under,
-    without,
 )
 from rs_localizer.estimation.points import MOST_POINTS, NEAREST, Observations, plane_of
 from rs_localizer.estimation.prior import SPEEDS, Assumed, PriorTerms, terms_at
@@ -92,13 +90,9 @@ _HIDDEN_ODDS = math.log(10.0)
 # Logarithm of the evidence of an ordinary vibration against none from which it is fitted; before a
 # plane, of whose leans that fit knows nothing.
 _ASKS, _ASKS_OF_PLANE = -0.5, 5.0
-# One frame tells no more of a vibration than this logarithm of odds: none is as Gaussian as that.
-_MOST_TOLD = 5.0
 # A last step this short, in squared standard deviations: the next one is its square.
 _SHORT = 1e-2
 _STEPS = 20
-# Pose and velocities with the vibration by all unknowns, see MIDDLE.
-_TURNED = np.hstack([np.eye(PARAMETERS), MIDDLE])[:MOTION_PARAMETERS]
 # Least eigenvalue of an information matrix scaled to a unit diagonal.
 _LEAST_EIGENVALUE = 1e-11
 # Fewer inliers determine nothing; nor, beside an in-frame turn, do these.
@@ -299,10 +293,8 @@ def _steady(given: _Given, hypotheses: list[MotionHypothesis], planar: bool) -> 
         np.array([mode.state for mode in modes]), np.zeros((len(modes), 0)),
         np.array([mode.covariance for mode in modes]), evidences,
     )  # fmt: skip
-    likely, possible = (
-        modes[int((evidences + preferences).argmax())],
-        weights_of(TEMPER * evidences),
-    )
+    likely = modes[int((evidences + preferences).argmax())]
+    possible = weights_of(TEMPER * evidences)
     shared = math.sqrt(possible @ np.square([mode.size for mode in modes]))
     of_speeds = np.zeros(len(SPEEDS))
     of_speeds[[SPEEDS.index(speed) for speed in speeds]] = possible
@@ -328,7 +320,11 @@ def _with_turn(
         odds = odds + before
     expected = float(np.logaddexp.reduce(odds))
     prior = VIBRATION._replace(odds=odds - expected)
-    gain, undetected, vibrations = _hidden(given, steady.posterior, prior)
+    motion, known = steady.posterior, known_at(given.terms, given.best.state)
+    gain, undetected, vibrations = hidden(
+        given.lines, given.best.inliers, given.frame.shared.at(motion.shared), known,
+        motion.noise, motion.freedom, prior,
+    )  # fmt: skip
     gain, posterior = gain + expected, steady.posterior._replace(vibrations=vibrations)
     vibrating = _vibrating(given, hypotheses, posterior, prior) if gain > asks else None
     if vibrating is None:
@@ -339,34 +335,6 @@ def _with_turn(
     # As if any speed left it, where vibration hardly shows.
     raised = vibrating.parts.evidences + max(total + gain - other, 0.0)
     return [steady, vibrating._replace(parts=vibrating.parts._replace(evidences=raised))]
-
-
-def _hidden(given: _Given, steady: Posterior, prior: TurnPrior) -> tuple[float, Array, Array]:
-    """Return evidence and effect of vibration at the best motion without it.
-
-    Returns:
-        logarithm of its evidence, against none; (12,12) second moments of the motion by it;
-        logarithms (k,) of the evidence of each size.
-    """
-    best, shared = given.best, given.frame.shared.at(steady.shared)
-    own = steady.shared**2 * shared.squares
-    # The degrees of freedom left are the same as with all sizes of the smooth error.
-    decided = len(shared.rows) - float(np.sum(own / (steady.noise**2 + own))) - steady.freedom
-    noise = Noise(steady.noise, 1.0, decided)
-    linear = linear_of(given.lines, best.inliers, True, shared.rows)
-    known = known_at(given.terms, best.state)
-    found = fit(linear, shared, known, noise, prior, True)
-    none = np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS))
-    if not found.evidence > -math.inf:
-        return -math.inf, none, np.zeros(0)
-    each = np.log(np.maximum(found.weights, TINY)) - prior.odds + found.gain
-    vibrations = np.clip(each, -_MOST_TOLD, _MOST_TOLD)
-    alone = fit(without(linear, "turn"), shared, known, noise, NO_TURN, True)
-    place = slice(0, MOTION_PARAMETERS)
-    move = _TURNED @ found.step - alone.step[place]
-    beside = (found.noise / noise.deviation) ** 2 * alone.covariance[place, place]
-    moments = _TURNED @ found.covariance @ _TURNED.T - beside + np.outer(move, move)
-    return found.gain, moments, vibrations
 
 
 def _with_middle(covariance: Array) -> Array:
@@ -422,10 +390,14 @@ def _vibrating(
         # rounding would show.
         first = np.concatenate([np.zeros(POSE.stop), -still[POSE_SIZE:], -now.turn])
         still = apply_step(still, first[:PARAMETERS])
-        linear = moved(linear_of(now.lines, now.inliers, True, shared.rows), first)
-        if in_frame is not None:
-            offset = step_between(given.terms.references[-1].copy(), still)
-            linear = changed(linear, in_frame.coupling(offset))
+        linear = linear_of(now.lines, now.inliers, True, shared.rows)
+        if in_frame is None:
+            linear = moved(linear, first)
+        else:
+            by = in_frame.coupling(step_between(given.terms.references[-1].copy(), still))
+            coupled = by.copy()
+            coupled[:-1, -1] += first
+            linear = changed(linear, coupled)
         known, is_last = known_at(given.terms, still), is_last or k == _STEPS - 1
         decided = float(PARAMETERS)  # by points
         if in_frame is not None:  # a step that is short would change the noise alone
@@ -434,7 +406,7 @@ def _vibrating(
         finely = is_last or in_frame is not None
         found = fit(linear, shared, known, Noise(noise, 1.0, decided), prior, finely)
         if in_frame is not None:
-            found = of_changed(found, in_frame.coupling(offset))
+            found = of_changed(found, by)
         step = first + found.step
         state, turn = now.after(step)
         if not (found.evidence > -math.inf and np.isfinite(state).all()):
@@ -479,7 +451,7 @@ def _mixed(given: _Given, groups: list[_Camera]) -> Posterior:
     if not len(likely.squared_errors):  # of all steady ones, and not of the best one alone
         likely = likely._replace(squared_errors=given.observations.squared_errors(found.state))
     arched = along_arcs(
-        found.covariance[:PARAMETERS, :PARAMETERS], found.state[STATE_TRANSLATION],
+        found.covariance[:PARAMETERS, :PARAMETERS].copy(), found.state[STATE_TRANSLATION],
         found.possible, found.offsets, found.covariances,
     )  # fmt: skip
     return likely._replace(state=found.state, covariance=covariance, arched=arched, shake=shake)

@@ -30,6 +30,7 @@ from rs_localizer.estimation.linear_fit import (
     TurnPrior,
 )
 from rs_localizer.estimation.prior import Prior
+from rs_localizer.estimation.robust import inverted
 from rs_localizer.estimation.window import MotionSample
 
 # Sizes of vibration that the other knowledge misses, over ordinary ones; none at first. Without the
@@ -72,10 +73,8 @@ def coupled_turn(rotation: RotationPrior, predicted: bool) -> CoupledTurn:
     by_scaled = np.linalg.solve(own / np.outer(scale, scale), (across / scale).T).T
     by_motion[:, place] = by_scaled / scale
     rest = rotation.covariance[turn, turn] - by_motion[:, place] @ across.T
-    sizes, axes = np.linalg.eigh(0.5 * (rest + rest.T))
-    sizes = np.maximum(sizes, _LEAST**2)
-    each = [sizes + missed**2 for missed in _MISSED]
-    informations = np.array([(axes / one) @ axes.T for one in each])
+    each = [rest + (_LEAST**2 + missed**2) * np.eye(TURNS) for missed in _MISSED]
+    informations = np.array([inverted(one) for one in each])
     odds = np.full(len(each), math.log((1.0 - _COMPLETE) / (len(each) - 1)))
     odds[0] = math.log(_COMPLETE)
     return CoupledTurn(by_motion, TurnPrior.of(informations, odds))

@@ -48,7 +48,7 @@ from rs_localizer.core.shake import (
     TYPICAL_SIZES,
     shake_basis,
 )
-from rs_localizer.core.state import ANGULAR, MOVE, PARAMETERS, TURN
+from rs_localizer.core.state import ANGULAR, MOTION_PARAMETERS, MOVE, PARAMETERS, TURN
 from rs_localizer.estimation.prior import PriorTerms, add_prior
 from rs_localizer.estimation.projection import Lines
 from rs_localizer.estimation.robust import LEAST_NOISE, TINY, back, eliminate, half_of
@@ -67,6 +67,9 @@ MIDDLE = np.zeros((PARAMETERS, TURNS))
 """How the coefficients of the in-frame turn turn the middle row, and how fast."""
 _VALUES, _RATES = MIDDLE_VALUES @ COMBINATIONS, MIDDLE_RATES @ COMBINATIONS
 MIDDLE[TURN], MIDDLE[ANGULAR] = np.kron(_VALUES, np.eye(3)), np.kron(_RATES, np.eye(3))
+# Pose and velocities with the vibration by all unknowns; places of the motion and the errors.
+_TURNED = np.hstack([np.eye(PARAMETERS), MIDDLE])[:MOTION_PARAMETERS]
+_UNTURNED = np.append(np.arange(PARAMETERS), PARAMETERS + TURNS)
 # Places of the unknowns and the errors among columns of which the turn's are sorted by axis.
 _BY_COMBINATION = np.append(np.arange(PARAMETERS), PARAMETERS + TURNS)
 _BY_COMBINATION = np.insert(
@@ -123,8 +126,12 @@ _LEAST_LEFT = 1e-4
 _LEAST_PART, _MOST_PART = 0.16, 1.3
 # Least share of the equations that columns leave to measure the noise with.
 _LEAST_FREEDOM = 0.1
+# Smooth errors with less than this part of the noise's variance in any column are one size.
+_UNSEEN = 0.05
 # Logarithm of the odds below which larger sizes are not looked at, and a size has no part.
 _HOPELESS, _NO_PART = 9.0, 1e-3
+# One frame tells no more of a vibration than this logarithm of odds: none is as Gaussian as that.
+_MOST_TOLD = 5.0
 # Points whose columns are multiplied at a time.
 _PART = 64
 
@@ -314,15 +321,15 @@ class KnownMotion(NamedTuple):
 class LinearFit(NamedTuple):
     """A Gaussian of all unknowns, integrated over the sizes of both."""
 
-    step: Array  # (p,) from where the products are; the turn is whole
-    covariance: Array  # (p,p)
+    step: Array1  # (p,) from where the products are; the turn is whole
+    covariance: Array2  # (p,p)
     evidence: float  # logarithm; minus infinity: nothing was found
     cost: float  # that is left at the most probable size, noise variances
     gain: float  # the part of it that the in-frame turn explains
     noise: float  # px
     size: float  # px, root mean square of what points share
     freedom: float
-    weights: Array  # (k,) of the Gaussians that are the in-frame turn's prior
+    weights: Array1  # (k,) of the Gaussians that are the in-frame turn's prior
 
 
 @entry
@@ -393,23 +400,28 @@ def marginal(fit: LinearFit, name: str) -> tuple[Array, Array]:
     return fit.step[place], fit.covariance[place, place]
 
 
+@entry
 def under(fit: LinearFit, before: KnownMotion, after: KnownMotion) -> LinearFit:
     """Return the fit under another prior of the motion, both at the products' state (Kalman 1960).
 
     The noise is unknown, so this is Student's form, too.
     """
-    place, form = BLOCKS["motion"], after.form - before.form
-    more, pull = form[place, place], form[place, -1]
-    mean, across = fit.step[place], fit.covariance[:, place]
-    whole = np.eye(PARAMETERS) + more @ across[place]
-    gain, pulled = np.linalg.solve(whole.T, across.T).T, np.linalg.solve(whole, pull + more @ mean)
+    m, form = PARAMETERS, after.form - before.form
+    more, pull = form[:m, :m].copy(), form[:m, -1].copy()
+    mean, across = fit.step[:m], fit.covariance[:, :m].copy()
+    whole = np.eye(m) + more @ across[:m]
+    gain = np.linalg.solve(whole.T.copy(), across.T.copy()).T.copy()
+    pulled = np.linalg.solve(whole, pull + more @ mean)
     step = fit.step - across @ pulled
-    cost = form[-1, -1] + float(pull @ step[place] + mean @ pulled)
-    evidence = after.volume - before.volume - 0.5 * float(np.linalg.slogdet(whole)[1])
+    cost = form[-1, -1] + np.sum(pull * step[:m]) + np.sum(mean * pulled)
+    evidence = after.volume - before.volume - 0.5 * np.linalg.slogdet(whole)[1]
     evidence -= 0.5 * fit.freedom * math.log(max(1.0 + cost / fit.freedom, _LEAST_LEFT))
-    covariance = fit.covariance - gain @ more @ across.T
-    covariance[:, place], covariance[place] = gain, gain.T  # not as a difference of large ones
-    return fit._replace(step=step, covariance=covariance, evidence=fit.evidence + evidence)
+    covariance = fit.covariance - gain @ more @ across.T.copy()
+    covariance[:, :m], covariance[:m] = gain, gain.T  # not as a difference of large ones
+    return LinearFit(
+        step, covariance, fit.evidence + evidence, fit.cost, fit.gain, fit.noise, fit.size,
+        fit.freedom, fit.weights,
+    )  # fmt: skip
 
 
 @entry
@@ -579,16 +591,21 @@ def fit(
     """
     grid, usual = len(shared.sizes), max(noise.deviation, ORDINARY)
     deviation, best, found = max(noise.deviation, LEAST_NOISE), -np.inf, []
-    for g in range(grid):
+    first, odds, largest = 0, shared.odds.copy(), np.max(shared.squares)
+    while first + 1 < grid and shared.sizes[first + 1] ** 2 * largest < _UNSEEN * deviation**2:
+        first += 1  # what is smaller is no other fit
+        odds[first] = np.logaddexp(odds[first - 1], odds[first])
+    shared = Shared(shared.rows, shared.squares, shared.sizes, odds)
+    for g in range(first, grid):
         one, rest = _at_size(linear, shared, g, deviation, known, noise, prior, finely)
-        if g == 0 and grid > 1:  # the noise is what this size leaves
+        if g == first and grid > 1:  # the noise is what this size leaves
             deviation = _near(rest, usual)
             one, rest = _at_size(linear, shared, g, deviation, known, noise, prior, finely)
         if not one.evidence > -np.inf:
             break
         found.append(one)
         deviation, best = _near(rest, usual), max(best, one.evidence)
-        if g and one.evidence < best - _HOPELESS and shared.odds[g] < shared.odds[g - 1]:
+        if g > first and one.evidence < best - _HOPELESS and odds[g] < odds[g - 1]:
             break
     size = len(linear.every) - 1
     step, covariance, weights = np.zeros(size), np.zeros((size, size)), np.zeros(len(prior.odds))
@@ -615,3 +632,36 @@ def fit(
         step, covariance, best + math.log(total), cost, gain, noise_found, math.sqrt(squares),
         max(freedom, 6.0), weights,
     )  # fmt: skip
+
+
+@entry
+def hidden(
+    lines: Lines, chosen: BoolArray1, shared: Shared, known: KnownMotion, deviation: float,
+    freedom: float, prior: TurnPrior,
+) -> tuple[float, Array, Array]:  # fmt: skip
+    """Return evidence and effect of vibration at the best motion without it.
+
+    Args:
+        shared: of one size, which is that without vibration.
+        deviation, freedom: of the noise (px), likewise.
+
+    Returns:
+        logarithm of its evidence, against none; (12,12) second moments of the motion by it;
+        logarithms (k,) of the evidence of each size.
+    """
+    place, taken = MOTION_PARAMETERS, taken_by(shared.squares, shared.sizes[0], deviation)
+    # The degrees of freedom left are the same as with all sizes of the smooth error.
+    noise = Noise(deviation, 1.0, len(shared.rows) - np.sum(taken) - freedom)
+    linear = linear_of(lines, chosen, True, shared.rows)
+    found = fit(linear, shared, known, noise, prior, True)
+    if not found.evidence > -np.inf:
+        return -np.inf, np.zeros((place, place)), np.zeros(0)
+    each = np.log(np.maximum(found.weights, TINY)) - prior.odds + found.gain
+    vibrations = np.minimum(np.maximum(each, -_MOST_TOLD), _MOST_TOLD)
+    every = linear.every[_UNTURNED][:, _UNTURNED].copy()
+    still = Linear(every, linear.beside[:, _UNTURNED].copy())
+    alone = fit(still, shared, known, noise, NO_TURN, True)
+    move = _TURNED @ found.step - alone.step[:place]
+    moments = _TURNED @ found.covariance @ _TURNED.T + np.outer(move, move)
+    moments -= (found.noise / deviation) ** 2 * alone.covariance[:place, :place]
+    return found.gain, moments, vibrations

@@ -46,7 +46,8 @@ _LEAST_EIGENVALUE = 1e-12
 # Squares of larger numbers, and inverses of smaller variances, are infinite.
 _FARTHEST, _LEAST_VARIANCE = 1e150, 1e-100
 # Rates of a turn and their changes, in a step.
-_TURNING = np.ix_(*[np.r_[ANGULAR, ANGULAR_ACCELERATION]] * 2)
+_RATES = np.r_[ANGULAR, ANGULAR_ACCELERATION]
+_TURNING = np.ix_(_RATES, _RATES)
 
 
 def check_motion(motion: Motion) -> None:
@@ -223,13 +224,17 @@ def motion_terms(velocities: Sequence[float], accelerations: Sequence[float]) ->
     return _single(np.diag(np.concatenate([np.zeros(6), np.repeat(precisions, 3)])), _STILL)
 
 
+# Velocities and accelerations are zero.
+_HELD = np.diag(np.repeat([0.0, _LEAST_DEVIATION**-2], [6, 12]))
+
+
 @cache
 def held_terms() -> PriorTerms:
     """Return the prior of a global shutter: velocities and accelerations are zero."""
-    precisions = np.repeat([0.0, _LEAST_DEVIATION**-2], [6, 12])
-    return _single(np.diag(precisions), _STILL)
+    return _single(_HELD, _STILL)
 
 
+@entry
 def terms_at(terms: PriorTerms, speed: float, turn_known: bool) -> PriorTerms:
     """Return the prior of a typical speed, a part of the configured one; 0: at rest.
 
@@ -237,17 +242,23 @@ def terms_at(terms: PriorTerms, speed: float, turn_known: bool) -> PriorTerms:
     jolts come at any speed. At rest, only gravity is as in the terms. What a known
     rotation leaves of a turn does not depend on the speed.
     """
-    informations = terms.informations.copy()
+    count = 1 if speed == 0.0 else len(terms.informations)
+    informations = terms.informations[:count].copy()
+    first = informations[0]
     if speed == 0.0:
-        informations = held_terms().informations.copy()
+        first[:] = _HELD
     else:
-        informations[0, ANGULAR] /= speed**2
-        informations[0, LINEAR] /= max(speed, _WALKING) ** 2
-        informations[0, ACCELERATIONS] /= min(_JOLTS * speed, 1.0) ** 2
+        first[ANGULAR] /= speed**2
+        first[LINEAR] /= max(speed, _WALKING) ** 2
+        first[ACCELERATIONS] /= min(_JOLTS * speed, 1.0) ** 2
     if turn_known:
-        informations[0][_TURNING] = terms.informations[0][_TURNING]
-    count = len(informations)
-    return PriorTerms(informations, terms.references[:count], terms.gravity, terms.pivots[:count])
+        for i in _RATES:
+            for j in _RATES:
+                first[i, j] = terms.informations[0, i, j]
+    return PriorTerms(
+        informations, terms.references[:count].copy(), terms.gravity.copy(),
+        terms.pivots[:count].copy(),
+    )  # fmt: skip
 
 
 def _single(information: Array, reference: Array) -> PriorTerms:
@@ -293,15 +304,24 @@ def with_motion(
     if prior.motion is None or not knows_motion(prior):
         return terms
     covariance = np.ascontiguousarray(prior.covariance, np.float64)
-    known = np.flatnonzero(np.isfinite(np.diagonal(covariance)))
-    information = np.zeros((PARAMETERS, PARAMETERS))
-    information[np.ix_(known, known)] = np.linalg.inv(covariance[np.ix_(known, known)])
     if len(covariance) == PARAMETERS:  # it knows the accelerations better than a default
         terms = terms._replace(informations=terms.informations.copy())
         terms.informations[0, ACCELERATIONS] = 0.0
         if turn_known:
             terms.informations[0][_TURNING] = 0.0
+    information = _information_of(covariance)
     return _with_term(terms, information, state_in(prior.motion, centre), pivot_of(covariance))
+
+
+@entry
+def _information_of(covariance: Array2) -> Array:
+    """Return the information (18,18) of a covariance, in which infinite variances know nothing."""
+    known, information = np.flatnonzero(np.isfinite(np.diag(covariance))), np.zeros_like(_HELD)
+    block = np.linalg.inv(covariance[known][:, known].copy())
+    for i in range(len(known)):
+        for j in range(len(known)):
+            information[known[i], known[j]] = block[i, j]
+    return information
 
 
 @entry

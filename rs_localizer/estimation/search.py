@@ -57,10 +57,11 @@ class Pool(NamedTuple):
     first of them (PROSAC: Chum, Matas, "Matching with PROSAC", CVPR 2005).
     """
 
-    points: IntArray  # (n,)
+    points: IntArray1  # (n,)
     row_range: float  # of the row times of its camera's points
     share: float  # of the samples
-    growth: Array  # samples that lie in the first points, from a sample's size on; empty: all alike
+    # (k,) samples that lie in the first points, from a sample's size on; (0,): all are alike
+    growth: Array1
 
     @classmethod
     def of(cls, points: IntArray, row_range: float, share: float, ranked: int) -> Pool:
@@ -71,11 +72,6 @@ class Pool(NamedTuple):
             first = np.arange(ranked, total)[:, None]
             growth = _RANKED_HORIZON * np.prod((first - k) / (total - k), axis=1)
         return cls(points, row_range, share, growth)
-
-    def prefixes(self, drawn: int, count: int) -> IntArray:
-        """Return from how many of the points each of the next (count,) samples is drawn."""
-        all_but = len(self.points) - len(self.growth)
-        return all_but + np.searchsorted(self.growth, drawn + np.arange(1.0, count + 1.0))
 
 
 def pools_of(
@@ -120,32 +116,35 @@ def _next(random: Any) -> Any:
 
 @entry
 def draw(
-    pool: IntArray1, prefixes: IntArray1, tau: Array1, row_range: float, random: Random,
-    samples: Out[IntArray2],
+    pool: Pool, drawn: int, tau: Array1, random: Random, samples: Out[IntArray2]
 ) -> None:  # fmt: skip
     """Fill ``samples`` (h,n) with distinct points of the pool, row by row.
 
-    Sample ``h`` comes from the first ``prefixes[h]`` points, which must be at least n.
+    Args:
+        drawn: samples before these.
     """
     count, size = samples.shape
+    points = pool.points
     for h in range(count):
+        among = int(np.searchsorted(pool.growth, drawn + h + 1.0))
+        among += len(points) - len(pool.growth)
         for _ in range(_MOST_REDRAWS):
             first, last = np.inf, -np.inf
             for i in range(size):
                 repeated = True
                 while repeated:
                     # The upper 32 bits times the size: unbiased to 2^-32 and without a division.
-                    position = ((_next(random) >> np.uint64(32)) * np.uint64(prefixes[h])) >> (
+                    position = ((_next(random) >> np.uint64(32)) * np.uint64(among)) >> (
                         np.uint64(32)
                     )
-                    point = pool[position]
+                    point = points[position]
                     repeated = False
                     for k in range(i):
                         repeated = repeated or samples[h, k] == point
                 samples[h, i] = point
                 first = min(first, tau[point])
                 last = max(last, tau[point])
-            if last - first >= _LEAST_ROW_SPREAD * row_range:
+            if last - first >= _LEAST_ROW_SPREAD * pool.row_range:
                 break
 
 
@@ -153,14 +152,13 @@ def _draw_all(
     pools: list[Pool], drawn: IntArray, tau: Array, random: Random, samples: IntArray
 ) -> None:
     """Fill the samples from all pools by their shares, and count what each has given."""
-    ends = np.cumsum([pool.share for pool in pools])
-    ends = (ends / ends[-1] * len(samples)).astype(np.int64)
-    ends[-1] = len(samples)
-    for k, (pool, last) in enumerate(zip(pools, ends.tolist(), strict=True)):
-        first = int(ends[k - 1]) if k else 0
-        prefixes = pool.prefixes(int(drawn[k]), last - first)
-        draw(pool.points, prefixes, tau, pool.row_range, random, samples[first:last])
+    first, share, total = 0, 0.0, sum(pool.share for pool in pools)
+    for k, pool in enumerate(pools):
+        share += pool.share
+        last = int(share / total * len(samples)) if k + 1 < len(pools) else len(samples)
+        draw(pool, int(drawn[k]), tau, random, samples[first:last])
         drawn[k] += last - first
+        first = last
 
 
 # The best two hypotheses of every block are optimized: a six-point model of inliers alone is often
@@ -315,12 +313,13 @@ def search(
             best, shares = found, None
         if shares is None and best.found:
             near = observations.within(best.state, final)
-            shares = np.array([np.count_nonzero(near[each.points]) for each in pools])
-            shares = shares / [len(each.points) for each in pools]
+            shares = [float(np.mean(near[each.points])) for each in pools]
         bar = min(bar, costs[0])
         left = draws.most - int(drawn.sum())
         # The chance that none of the samples held inliers alone.
-        missed = 1.0 if shares is None else np.prod((1.0 - shares**solver.sample_size) ** drawn)
+        missed = 1.0
+        for share, count in zip(shares or (), drawn.tolist(), strict=False):
+            missed *= (1.0 - share**solver.sample_size) ** count
         if missed < 1.0 - draws.confidence:
             break
     return best._replace(samples=int(drawn.sum()))

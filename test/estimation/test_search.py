@@ -89,8 +89,8 @@ def samples_of(as_python):
     drawn = as_python(draw)
 
     def samples_of(pool, count, size, tau):
-        samples, all_of_it = np.full((count, size), -1), np.full(count, len(pool))
-        drawn(pool, all_of_it, tau, float(np.ptp(tau)), generator(0), samples)
+        samples = np.full((count, size), -1)
+        drawn(Pool.of(pool, float(np.ptp(tau)), 1.0, 0), 0, tau, generator(0), samples)
         return samples
 
     return samples_of
