@@ -100,7 +100,7 @@ NO_EFFECT = CalibrationEffect(np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)), 
 
 def calibration_effect(
     observed: Observed, posterior: Posterior, terms: PriorTerms, deviation: CalibrationErrors,
-    tracked: bool, part: MovedPart | None = None,
+    tracked: bool, moved: MovedPart | None = None,
 ) -> CalibrationEffect:  # fmt: skip
     """Return the effect of errors of calibration and map on the motion of a frame.
 
@@ -108,7 +108,7 @@ def calibration_effect(
         terms: what is known of the motion but for poses of other frames, which are off by as much.
         tracked: poses of other frames are known, so that the covariance has no longer all of what
             the smooth error does.
-        part: of the map that is elsewhere; what it leaves of the points nobody has declared.
+        moved: part of the map that is elsewhere; what it leaves of the points nobody has declared.
     """
     observations, chosen = observed.observations, np.flatnonzero(posterior.inliers)
     exposure, found = observed.exposure, len(chosen)
@@ -130,9 +130,9 @@ def calibration_effect(
             )
     declared = columns.shape[2]
     of_map = observed.error_modes
-    if of_map is not None or part is not None:
+    if of_map is not None or moved is not None:
         places = observed.points[observed.usable.indices[chosen]]
-        modes = [each.at(places) for each in (of_map, part) if each is not None]
+        modes = [each.at(places) for each in (of_map, moved) if each is not None]
         declared += modes[0].shape[2] if of_map is not None else 0
         # A camera that moves as the point does would move it the other way: of a deviation either
         # sign will do.

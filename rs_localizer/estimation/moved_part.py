@@ -259,7 +259,8 @@ def moved_part(looks: Sequence[Look], map_deviation: float) -> MovedPart | None:
         map_deviation: m, as declared.
     """
     frames = _Frames.of(looks)
-    points, fitting = frames.points, frames.inliers.any(axis=0)
+    points = frames.points
+    fitting: BoolArray = np.any(frames.inliers, axis=0)
     alone = _beside(frames, frames.inliers, declared=False)
     first = _fitted(frames, alone, np.zeros(len(points), np.bool_), frames.inliers)
     starts = [_side(frames, alone, fitting)]
@@ -332,7 +333,7 @@ def _settled(frames: _Frames, part: BoolArray) -> _Split | None:
             break
     else:
         fit = _fitted(frames, beside, part, kept)
-    found = kept.any(axis=0)
+    found: BoolArray = np.any(kept, axis=0)
     count, size = int(np.count_nonzero(found)), int(np.count_nonzero(part & found))
     if not _OF_SHIFT < size < count:
         return None
