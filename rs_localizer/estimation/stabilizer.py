@@ -28,7 +28,7 @@ _LIKELY = 5.0
 
 
 class RowRotation(NamedTuple):
-    """What the rows of a frame turn beside the motion between frames."""
+    """The rotation over the rows of a frame, beside the motion between frames."""
 
     turned: Array  # (6,) rotation, rad per readout, and how it changes, rad per readout squared
     covariance: Array  # (6,6)
