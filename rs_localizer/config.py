@@ -157,10 +157,11 @@ class CalibrationErrors:
     """Errors of the lens's calibration: parts that do not overlap.
 
     The defaults fit a board that was held before an ordinary camera for half a minute;
-    ``rs_localizer calibrate`` writes its own deviations. Simulated, 1207 px of focal length, 0.3 px
-    of noise: before 150 points of a room the principal point widens orientations from 0.006 to
-    0.039 deg, and focal length, aspect ratio and distortion widen positions from 0.2 to 2.2, 1.7
-    and 0.4 mm. Before a board of 0.6 m, 2 m away, all of them together add 7 %.
+    ``rs_localizer calibrate`` writes its own deviations. For 1207 px of focal length and 0.3 px of
+    noise, simulations show what the defaults cost. Before 150 points of a room, the principal point
+    widens orientations from 0.006 to 0.039 deg. Positions of 0.2 mm become 2.2 mm by the focal
+    length, 1.7 mm by the aspect ratio, and 0.4 mm by the distortion. Before a board of 0.6 m that
+    is 2 m away, all defaults together add 7 %.
     """
 
     principal_point: float = setting(
