@@ -32,6 +32,7 @@ from rs_localizer.core.rig import ByCamera, Rig, RigEstimate
 from rs_localizer.core.rotation_prior import RotationPrior
 from rs_localizer.core.state import (
     ANGULAR,
+    LINEAR,
     PARAMETERS,
     TURN,
     VELOCITIES,
@@ -75,6 +76,9 @@ _MOST_INNOVATION = 62.0
 # Of the logarithm of the odds of a vibration, the part that the next frame has of it: sizes and
 # spectra last for ten frames.
 _REMEMBERED = 0.9
+# How fast a camera may be that a track begins with, in configured deviations: who hardly turns is
+# taken for slow by one image, and may be a car.
+_FAST = 2.0
 # Covariance of a motion that is only a first guess.
 _UNKNOWN = np.diag(np.full(PARAMETERS, np.inf))
 # The least acceleration that a configuration may have, rad/s^2 and m/s^2.
@@ -676,9 +680,9 @@ class Tracker:
             window = replace(track.window, readout_share=share).joined(told)
             if window.surprise < _MOST_INNOVATION:  # NaN, of rounding errors, is not
                 return window
-        alone = MotionWindow.begin(
-            gaussian_of(result, time_ns), self.localizer.config.acceleration, share
-        )
+        config, start = self.localizer.config, gaussian_of(result, time_ns)
+        start.covariance[LINEAR, LINEAR] += (_FAST * config.velocity_prior.linear) ** 2 * np.eye(3)
+        alone = MotionWindow.begin(start, config.acceleration, share)
         return alone if track is None else replace(alone, deviations=track.window.deviations)
 
     def _beside_aid(self, track: _Track) -> Acceleration:
