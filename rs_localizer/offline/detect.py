@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.scanning import ScanDirection
@@ -38,7 +39,8 @@ _FEW = 0.3
 # After this many images without the map, a few seconds of a video, chance is excluded.
 _PATIENCE = 64
 # A global-shutter pose leaves at most so much (px rms) in the stillest images, in percent of all,
-# unless calibration or map are wrong: a good one leaves 0.1 to 0.5.
+# unless calibration or map are wrong: a good one leaves 0.1 to 0.5. No readout takes longer than
+# the time between two images: who leaves less than what moved between them may just have moved.
 _MOST_STILL, _STILL_PERCENT = 1.5, 10.0
 # If none fits, this many images of another size than the calibration's are no stray ones.
 _MISFITS = 3
@@ -178,6 +180,8 @@ class _MarkerTally:
         self._others: Counter[str] = Counter()
         self._faults: Counter[str] = Counter()
         self._residuals: list[float] = []
+        self._telling: list[float] = []  # those that are not of motion during the readout
+        self._before: dict[tuple[float, ...], Array] = {}  # pixels of the image before, by point
 
     def add(self, camera: Camera, detected: Detected) -> None:
         detections = detected.detections
@@ -185,7 +189,19 @@ class _MarkerTally:
         self._faults.update(detections.faults)
         if len(detections.ids):
             self._found.counts.append(len(detections.ids))
-            self._residuals.append(static_residual(camera, detected))
+            residual = static_residual(camera, detected)
+            self._residuals.append(residual)
+            moved = self._moved(detected)
+            if residual <= _MOST_STILL or moved < residual:
+                self._telling.append(residual)
+
+    def _moved(self, detected: Detected) -> float:
+        """Return the motion (px rms) since the image before; infinite where it is unknown."""
+        points, pixels = detected.detections.points, detected.detections.pixels
+        now = dict(zip(map(tuple, points.tolist()), pixels, strict=True))
+        before, self._before = self._before, now
+        moved = [now[point] - before[point] for point in now.keys() & before.keys()]
+        return float(np.sqrt(np.mean(np.sum(np.square(moved), axis=1)))) if moved else np.inf
 
     @property
     def are_few(self) -> bool:
@@ -215,7 +231,9 @@ class _MarkerTally:
         faults = list[str]()
         if mistake := self._detector.mistake:
             faults.append(mistake)
-        elif known and (least := float(np.percentile(known, _STILL_PERCENT))) > _MOST_STILL:
+        elif (telling := self._telling) and (
+            least := float(np.percentile(telling, _STILL_PERCENT))
+        ) > _MOST_STILL:
             faults.append(
                 f"even the stillest images leave {least:.1f} px rms: the calibration can hardly be "
                 "of this camera in this mode, or the map (sizes, positions) is wrong"

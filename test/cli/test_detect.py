@@ -234,6 +234,22 @@ def test_a_wrong_calibration_is_named(here, capsys):
     assert re.search(r"warning: even the stillest images leave \d+\.\d px rms: the calib", said)
 
 
+def test_motion_during_the_readout_is_no_fault_of_the_calibration(here, capsys):
+    """Each row of an image is half a pixel beside the one above; the next image is 100 px off."""
+    images = [
+        cv2.warpAffine(
+            board(x=0.075 * side), np.array([[1.0, 0.5 * side, -60.0 * side], [0, 1, 0]]),
+            (320, 240), borderMode=cv2.BORDER_REPLICATE,
+        )
+        for side in (1, -1) * 3
+    ]  # fmt: skip
+    source = folder(here.path / "images", images)
+    assert detect(here, source, *here.calibration, *here.board, "--rate", "30") == 0
+    said = capsys.readouterr().out
+    assert float(re.search(r"within (\S+) px rms of a global-shutter pose", said)[1]) > 1.5
+    assert "warning" not in said
+
+
 @pytest.mark.parametrize(("first", "last", "code"), [(0, 1, 0), (5, 6, 0), (0, 12, 1)])
 def test_images_of_another_size_are_left_out_or_named(here, first, last, code, capsys):
     boards = [board(x=0.001 * k) for k in range(12)]
