@@ -6,7 +6,7 @@ import importlib
 
 TYPE_CHECKING = False  # type checkers take it for typing's, which takes milliseconds to import
 if TYPE_CHECKING:
-    from rs_localizer.config import Acceleration, LocalizerConfig, VelocityPrior
+    from rs_localizer.config import Acceleration, CalibrationErrors, LocalizerConfig, VelocityPrior
     from rs_localizer.core.camera import Camera, DistortionModel, Roi
     from rs_localizer.core.reasons import Reason
     from rs_localizer.core.rectification import rectify
@@ -27,6 +27,7 @@ __version__ = "0.9.0"
 
 __all__ = [
     "Acceleration",
+    "CalibrationErrors",
     "Camera",
     "CameraState",
     "DistortionModel",
@@ -56,7 +57,7 @@ if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all
     # NumPy and OpenCV take tenths of a second to import. Who imports this package only to start a
     # program does not wait for them, and it can take Ctrl-C in hand before they come (PEP 562).
     _HOMES = {
-        "config": ("Acceleration", "LocalizerConfig", "VelocityPrior"),
+        "config": ("Acceleration", "CalibrationErrors", "LocalizerConfig", "VelocityPrior"),
         "core.camera": ("Camera", "DistortionModel", "Roi"),
         "core.reasons": ("Reason",),
         "core.rectification": ("rectify",),

@@ -51,6 +51,10 @@ def setting(
     return field(default=default, metadata=metadata)
 
 
+# In descriptions of settings, as "Deviation of the time, in s; 0: unknown".
+_UNIT = re.compile(r", in ([^\s;,]+)(?=[;,]|$)")
+
+
 def check(config: Any, prefix: str = "") -> None:
     """Raise ``ValueError`` for the first setting whose type, range or choice is wrong."""
     for item in fields(config):
@@ -74,7 +78,9 @@ def check(config: Any, prefix: str = "") -> None:
             raise ValueError(f"{name} must be one of {', '.join(choices)}; got {value!r}")
         low, high = item.metadata["minimum"], item.metadata["maximum"]
         if low is not None and not (low <= value <= high):
-            raise ValueError(f"{name} must lie between {low} and {high}, got {value!r}")
+            unit = _UNIT.search(item.metadata["description"])
+            unit_name = f" {unit[1]}" if unit else ""
+            raise ValueError(f"{name} must lie between {low} and {high}{unit_name}, got {value!r}")
 
 
 def type_of(default: Any) -> str:
@@ -239,7 +245,11 @@ class LocalizerConfig:
 
     def __post_init__(self) -> None:
         check(self)
-        for name, kind in (("velocity_prior", VelocityPrior), ("acceleration", Acceleration)):
+        for name, kind in (
+            ("velocity_prior", VelocityPrior),
+            ("acceleration", Acceleration),
+            ("calibration", CalibrationErrors),
+        ):
             if not isinstance(getattr(self, name), kind):
                 raise ValueError(
                     f"{name} must be of type {kind.__name__}, got {getattr(self, name)!r}"

@@ -6,7 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig, VelocityPrior
+from rs_localizer.config import (
+    DetectorConfig,
+    FeatureConfig,
+    LocalizerConfig,
+    NodeConfig,
+    VelocityPrior,
+)
 from rs_localizer.settings import SettingsError, build, load_params_file, parse_assignment, settings
 
 SHIPPED = Path(__file__).parents[1] / "config"
@@ -111,7 +117,8 @@ def test_assignments(text, name, value):
     [
         ({"solver": "epnp"}, "solver must be one of .*; got 'epnp'"),
         ({"seed": 1.5}, "seed must be of type int, got 1.5"),
-        ({"velocity_prior.linear": -1.0}, "velocity_prior.linear must lie between"),
+        ({"velocity_prior.linear": -1.0}, "linear must lie between 0.0 and 10000.0 m/s, got -1"),
+        ({"readout_time": 30.0}, "readout_time must lie between 0.0 and 0.2 s, got 30.0"),
         ({"imu.use": "yes"}, "imu.use must be one of auto, none; got 'yes'"),
         ({"gravity_in_map": [0.0, 1.0]}, r"must be 3 numbers, as \[0.0, 0.0, -1.0\]"),
     ],
@@ -119,3 +126,10 @@ def test_assignments(text, name, value):
 def test_wrong_values(values, fault):
     with pytest.raises(ValueError, match=fault):
         build(values)
+
+
+@pytest.mark.parametrize("value", [None, {"focal_length": 0.01}])
+@pytest.mark.parametrize("name", ["velocity_prior", "acceleration", "calibration"])
+def test_a_group_of_settings_is_of_its_own_class(name, value):
+    with pytest.raises(ValueError, match=rf"{name} must be of type \w+, got {value}"):
+        LocalizerConfig(**{name: value})

@@ -10,7 +10,8 @@ the raw row of the full sensor: distortion moves light between rows, not rows in
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import reprlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import lru_cache
@@ -35,12 +36,16 @@ Vector = NDArray[Any] | Sequence[float]
 E = TypeVar("E", bound=StrEnum)
 
 
-def numbers(name: str, values: Any) -> Array:
-    """Return a new float64 array of the values; ValueError for anything that is no number."""
+def numbers(name: str, values: Any, take: Callable[..., Array] = np.array) -> Array:
+    """Return a float64 array of the values, new by default; ValueError for what is no number."""
+    if np.ma.is_masked(values):
+        raise ValueError(f"{name} must be finite, found masked values: leave out their rows")
     try:
-        return np.array(values, dtype=np.float64)
+        if values is not None:  # which NumPy takes for NaN
+            return take(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{name} must be numbers, got {values!r}") from None
+        pass
+    raise ValueError(f"{name} must be numbers, got {reprlib.repr(values)}")
 
 
 def pixel_count(name: str, value: Any) -> int:
@@ -80,7 +85,7 @@ class DistortionModel(StrEnum):
 
 
 _WIDEST = 2**16  # pixels: line-scan cameras have 16,384
-_LONGEST_READOUT = 1.0  # s: more than any camera takes for a picture of a moving world
+_LONGEST_READOUT = 0.5  # s: more than any camera takes, also for a picture of a still world
 # Pixels; a lens is neither a needle's eye nor a telescope of the next galaxy.
 _LEAST_FOCAL, _MOST_FOCAL = 1e-3, 1e9
 # A pixel that does not come back to itself has no bearing: it lies beyond the model's range.

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from typing import TYPE_CHECKING, Any, Literal, NoReturn, Self
 
 import numpy as np
@@ -28,6 +29,8 @@ _ROWS = np.linspace(-0.5, 0.5, 17)
 _PARABOLAS = np.vander(_ROWS, 3) @ np.linalg.pinv(np.vander(_ROWS, 3))
 # Pixels at the rim lie a little beyond the first and the last row.
 _LAST_ROW = 0.55
+# s: no motion goes on as it is for so long; more are milliseconds or nanoseconds.
+_LONGEST_AWAY = 60.0
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -123,11 +126,11 @@ class Estimate(Motion):
         Raises:
             ValueError: beyond the rows; :meth:`at_time` goes on.
         """
-        if not abs(tau) <= _LAST_ROW:
+        if not (isinstance(tau, Real) and abs(tau) <= _LAST_ROW):
             raise ValueError(
                 f"tau must lie between -0.5, the first row, and 0.5, the last, got {tau!r}: it is "
                 "a row time, neither seconds nor a row: camera.row_time(pixels) gives those of "
-                "pixels, result.at_time(seconds) goes beyond the rows"
+                "pixels, result.at_time(seconds) goes beyond the rows, at_rows takes several"
             )
         return self._at(tau)
 
@@ -169,6 +172,11 @@ class Estimate(Motion):
         """
         if not (math.isfinite(seconds) and self.span > 0.0):
             raise ValueError(f"needs finite seconds and a span, got {seconds!r} and {self.span}")
+        if abs(seconds) > _LONGEST_AWAY:
+            raise ValueError(
+                f"{seconds:g} s from the middle row is too far: the time is in seconds, and no "
+                f"motion goes on for more than {_LONGEST_AWAY:g}"
+            )
         tau = seconds / self.span
         later, transport = carried(numbers_of(self), tau, _NO_FADING)
         rotation, translation = self._at(tau)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ from rs_localizer.core.arrays import (
     Random,
 )
 from rs_localizer.core.blocks import median
+from rs_localizer.core.camera import numbers
 from rs_localizer.core.rig import Exposure, Mounts, Rig
 from rs_localizer.core.rotation_prior import RotationPrior, compensated
 from rs_localizer.core.simd.tracing import LANES
@@ -75,22 +77,22 @@ def checked(
     Raises:
         ValueError: wrong shapes, or values that are not finite.
     """
-    points = np.require(points, np.float64, ["C", "A", "W"])
-    pixels = np.require(pixels, np.float64, ["C", "A", "W"])
+    take = partial(np.require, requirements=["C", "A", "W"])
+    points, pixels = numbers("points", points, take), numbers("pixels", pixels, take)
     if points.size == 0 and pixels.size == 0:  # empty lists have no second dimension
         points, pixels = points.reshape(0, 3), pixels.reshape(0, 2)
     points, pixels = (
         array[:, 0] if array.ndim == 3 and array.shape[1] == 1 else array
         for array in (points, pixels)
     )
-    n = len(points)
+    n = points.size // 3
     if points.shape != (n, 3) or pixels.shape != (n, 2):
         raise ValueError(
             f"points must be (n,3) and pixels (n,2), got {points.shape} and {pixels.shape}"
         )
     checks = [("points", points), ("pixels", pixels)]
     if scores is not None:
-        scores = np.require(scores, np.float64, ["C", "A"])
+        scores = numbers("scores", scores, take)
         if scores.shape != (n,):
             raise ValueError(f"scores must be ({n},), got {scores.shape}")
         checks.append(("scores", scores))

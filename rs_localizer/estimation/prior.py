@@ -9,6 +9,7 @@ what it adds to the normal equations. :func:`assumptions` makes them of the conf
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
@@ -19,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig, RefinementKind
 from rs_localizer.core.arrays import Array, Array1, Array2, Array3, Out
+from rs_localizer.core.camera import numbers
 from rs_localizer.core.rig import Rig
 from rs_localizer.core.rotation_prior import ROTATION, RotationPrior
 from rs_localizer.core.shutter import Motion
@@ -97,6 +99,8 @@ def check_covariance(covariance: Array) -> None:
 
 # Least deviation of a measurement; with it a velocity is held at its mean whatever the points say.
 _LEAST_DEVIATION = 1e-9
+# Of a direction; with more it may point anywhere.
+_MOST_DEVIATION = math.pi / 2.0, " rad"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,15 +145,16 @@ class Prior:
             vector = getattr(self, name)
             if vector is None:
                 continue
-            array = np.array(vector, dtype=np.float64)
+            array = numbers(name, vector)
             if array.shape != (3,) or not np.all(np.isfinite(array)):
                 raise ValueError(f"{name} must be three finite numbers, got {vector!r}")
             if name != "angular_velocity" and not np.abs(array).max() > 0.0:
                 raise ValueError(f"{name} has no direction: {vector!r}")
             deviation = getattr(self, f"{name}_deviation", 1.0)
-            if not _LEAST_DEVIATION <= deviation < math.inf:
+            most, unit = _MOST_DEVIATION if name == "gravity" else (sys.float_info.max, "")
+            if not _LEAST_DEVIATION <= deviation <= most:
                 raise ValueError(
-                    f"{name}_deviation must be at least {_LEAST_DEVIATION:g} and finite, "
+                    f"{name}_deviation must lie between {_LEAST_DEVIATION:g} and {most:.3g}{unit}, "
                     f"got {deviation}"
                 )
 

@@ -157,7 +157,9 @@ def test_inside_is_the_area_of_the_pixels():
         ({"K": np.zeros((3, 3))}, "not calibrated: focal lengths are 0, 0"),
         ({"D": [0.1, 0.2]}, "plumb_bob takes 0 or 4 or 5 coefficients, got 2"),
         ({"distortion_model": "fov"}, "one of plumb_bob, .*; got 'fov'"),
-        ({"readout_time": 30}, "at most 1 s, got 30: it is in seconds; 30 ms are 0.03"),
+        ({"readout_time": 30}, r"at most 0\.5 s, got 30: it is in seconds; 30 ms are 0.03"),
+        ({"readout_time": 0.9}, r"at most 0\.5 s, got 0\.9"),
+        ({"K": None}, "K must be numbers, got None"),
         ({"roi": Roi(0, 0, 700, 480)}, "does not lie on a sensor of 640x480"),
     ],
 )

@@ -118,9 +118,11 @@ def test_what_a_result_says_of_itself():
     assert "2 of 3 inliers" in repr(found)
     deviation = math.sqrt(np.linalg.eigvalsh(found.joint_covariance[:3, :3])[-1])
     assert found.orientation_deviation == pytest.approx(deviation)
-    for tau in (240.0, -0.6, np.nan):
+    for tau in (240.0, -0.6, np.nan, "x", None, np.array([0.0, 0.1])):
         with pytest.raises(ValueError, match=r"tau must lie between -0\.5, the first row"):
             found.at(tau)
+    with pytest.raises(ValueError, match=r"2e\+07 s from the middle row is too far"):
+        found.at_time(2e7)
     with pytest.raises(ValueError, match="needs finite seconds and a span"):
         replace(found, span=0.0).at_time(0.01)
     nothing = Failure(Reason.DEGENERATE, "a line")

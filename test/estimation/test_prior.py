@@ -112,6 +112,7 @@ def test_a_motion_prior_costs_the_mahalanobis_distance_about_its_pivot(size):
         ({"motion": motion(), "covariance": np.zeros((12, 12))}, "must be positive definite"),
         ({"motion": replace(motion(), rotation=2 * np.eye(3)), "covariance": np.eye(12)},
          "rotation is not orthonormal"),
+        ({"gravity": [0, 0, 1], "gravity_deviation": 30}, r"and 1\.57 rad, got 30"),
         ({"gravity": [0, 0, 0], "gravity_deviation": 1}, "gravity has no direction"),
     ],
 )  # fmt: skip
