@@ -85,6 +85,7 @@ class CameraFrames(FrameLocalizer):
         self._waiting: dict[int, tuple[Correspondences, PublishedMoment]] = {}
         # The newest of them that has a pose, without its rows.
         self._newest: Correspondences | None = None
+        self._scale_is_odd = False  # whether poses say, or soon may say, so of the map
         self._faults: set[str] = set()  # of the shutter, which have been noticed
 
     @property
@@ -195,7 +196,9 @@ class CameraFrames(FrameLocalizer):
         result = tracker.newest
         assert result is not None
         if result:
-            self._stream.pace(time_ns, result, cloud.points, self._config)
+            self._scale_is_odd = self._stream.pace(
+                time_ns, result, cloud.points, self._config, lambda: self._alone(cloud, result)
+            )
             self._pose_prior.judge_result(result)
             if self.predicts:
                 self._newest = replace(cloud, table=cloud.table[:0], dropped=0)
@@ -220,6 +223,15 @@ class CameraFrames(FrameLocalizer):
             ),
         )
 
+    def _alone(self, cloud: Correspondences, result: Estimate) -> Estimate | Failure:
+        """Return the pose of a frame that the frames before do not hold, if they may do so."""
+        tracker = self._tracker
+        if not result.tracked:
+            return result
+        if not (tracker.lens.is_beyond(result) or self._scale_is_odd):
+            return Failure(Reason.AWAITS_FRAMES, "")
+        return tracker.localizer.localize(cloud.points, cloud.pixels, cloud.scores)
+
     def _expect(self, time_ns: int, map_frame: str) -> None:
         """Tell the tracker what others know of the pose at a time, if it knows nothing itself."""
         if not (self.calibrations and self._pose_prior.given):
@@ -239,13 +251,13 @@ class CameraFrames(FrameLocalizer):
         if result.integrity > DOUBTFUL:
             text = f"pose or map are wrong with a probability of {result.integrity:.0%}"
             self._notice(Notice.DOUBTFUL, text)
-        else:
+        elif not self._scale_is_odd:  # which also looks like a moved part of the map
             gone = stale_landmarks(cloud, self._tracker.stale(cloud.points))
             for said in filter(None, (gone, moved_landmarks(cloud, self._tracker.moved))):
                 self._notice(Notice.STALE_LANDMARKS, said)
         if result.left_out:
             self._notice(Notice.DOUBTFUL, result.left_out)
-        if self._tracker.lens.fault:
+        if self._tracker.lens.fault and not self._scale_is_odd:
             self._notice(Notice.LENS, self._tracker.lens.fault)
         return self._result(cloud, result, moment, self._config.readout_time_deviation)
 

@@ -27,6 +27,9 @@ class Heard:
     def notices(self) -> list[str]:
         return [name for name, _ in self.told]
 
+    def pace(self, time_ns: int, estimate: Any, points: Any) -> bool:
+        return self.stream.pace(time_ns, estimate, points, NodeConfig(), lambda: estimate)
+
     def reason(self, seconds: float, frame: str = "map") -> Any:
         refusal = self.stream.follow(round(seconds * SECOND), frame)
         return None if refusal is None else refusal.reason
@@ -56,12 +59,18 @@ def test_a_stamp_of_zero_is_none_and_ends_no_track():
 
 
 @pytest.mark.parametrize(
-    ("unit", "speed", "noise", "told"),
-    [(1.0, 1.5, 0.01, False), (1000.0, 0.2, 0.01, True), (1000.0, 0.0, 0.01, False),
-     (1.0, 40.0, 0.01, False), (1.0, 0.0, 30.0, False)],
-)  # fmt: skip
-@pytest.mark.parametrize("to_and_fro", [False, True])
-def test_a_map_in_millimetres_is_named(unit, speed, noise, told, to_and_fro):
+    ("unit", "depth", "speed", "noise", "to_and_fro", "told"),
+    [
+        (1000.0, 2.0, 0.2, 0.01, True, "millimetres"),
+        (1000.0, 2.0, 0.2, 0.01, False, "millimetres"),
+        (100.0, 4.0, 0.4, 0.01, True, "centimetres"),
+        (1000.0, 2.0, 0.0, 0.01, False, ""),
+        (1.0, 100.0, 40.0, 0.1, False, ""),  # a car
+        (1.0, 50.0, 4.0, 0.1, True, ""),  # a drone, 40 m/s^2
+        (1.0, 100.0, 0.0, 30.0, False, ""),
+    ],
+)
+def test_the_unit_of_a_map_is_named(unit, depth, speed, noise, to_and_fro, told):
     rng = np.random.default_rng(0)
     heard = Heard()
     for i in range(90):
@@ -72,24 +81,27 @@ def test_a_map_in_millimetres_is_named(unit, speed, noise, told, to_and_fro):
         estimate: Any = SimpleNamespace(
             position=unit * place, rotation=np.eye(3), covariance=covariance, inliers=[0, 1, 2]
         )
-        points = estimate.position + unit * 2.0 * np.eye(3)[[2, 2, 2]]
-        heard.stream.pace(i * SECOND // 30, estimate, points, NodeConfig())
-    assert ("map_scale" in heard.notices) == told
+        points = estimate.position + unit * depth * np.eye(3)[[2, 2, 2]]
+        odd = heard.pace(i * SECOND // 30, estimate, points)
+    assert (odd, "map_scale" in heard.notices) == (bool(told), bool(told))
+    for _, text in heard.told:
+        assert f"{unit * depth:.0f} m from the points: is the map in {told}?" in text
+        assert f"by a factor of {1.0 / unit:g} (map align --scale)" in text
     if told:
-        texts = [text for _, text in heard.told]
-        speeds = [float(text.split(" m/s")[0].split()[-1]) for text in texts]
+        speeds = [float(text.split(" m/s")[0].split()[-1]) for _, text in heard.told]
         assert np.median(speeds) == pytest.approx(unit * speed, rel=0.25)
-        assert "2000 m from the points" in texts[-1]
-        assert texts[-1].endswith(
-            "by a factor of 0.001 (map align --scale), these are "
-            f"{1e-3 * speeds[-1]:.2g} m/s and 2 m"
-        )
 
 
 def test_what_happened_while_nothing_was_seen_is_no_speed():
     """A robot that was carried elsewhere, or a map that was exchanged."""
     heard, covariance = Heard(), np.diag(np.full(12, 1e-4))
     for i in range(6):
-        estimate: Any = SimpleNamespace(position=np.full(3, 1e3 * i), covariance=covariance)
-        heard.stream.pace(round(0.6 * i * SECOND), estimate, np.zeros((0, 3)), NodeConfig())
+        estimate: Any = SimpleNamespace(
+            position=np.full(3, 1e3 * i),
+            rotation=np.eye(3),
+            covariance=covariance,
+            inliers=[0, 1, 2],
+        )
+        points = estimate.position + 100.0 * np.eye(3)[[2, 2, 2]]
+        heard.pace(round(0.6 * i * SECOND), estimate, points)
     assert heard.notices == []
