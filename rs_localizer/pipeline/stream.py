@@ -24,8 +24,8 @@ _FASTER, _NEAR = 33.0, 30.0
 _TOO_FAST, _WINDOW, _LONGEST_STEP, _APART = 20.0, 2.0, 0.5, 0.09
 _STEP, _ROUNDING = 0.2, 1e-6  # s from pose to pose: noise of some 10 mm is 0.4 m/s^2
 _ENOUGH = 3  # accelerations of which the median counts
-# m, of what most cameras look at; the geometric mean of 100 and 1000.
-_USUAL, _BETWEEN = 3.0, 316.0
+# How fast hands are (m/s), and how far what they look at (m); the geometric mean of 100 and 1000.
+_SPEED, _DEPTH, _BETWEEN = 0.5, 3.0, 316.0
 
 
 class Stream:
@@ -127,7 +127,7 @@ def _odd_scale(
         return None if len(places) > 1 else ""
     if faster < _FASTER and not 0.0 < _TOO_FAST * most < speed:
         return ""
-    is_fine = faster < _FASTER or math.sqrt(faster * depth / _USUAL) > _BETWEEN
+    is_fine = math.sqrt(speed / _SPEED * depth / _DEPTH) > _BETWEEN
     unit, factor = ("millimetres", 1e-3) if is_fine else ("centimetres", 1e-2)
     return (
         f"by its poses the camera moves at {speed:.0f} m/s and {acceleration:.0f} m/s^2, "

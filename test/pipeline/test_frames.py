@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rs_localizer import data
 from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.camera_files import lens_parameters
@@ -16,6 +17,7 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.rigs import RigParts, mounted_lenses, node_parameters, read_camchain
+from rs_localizer.io.trajectories import read_tum
 from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.pipeline.rig_frames import RigFrames
@@ -23,7 +25,11 @@ from rs_localizer.settings import build, camera_values, write_camera_file
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, simulate_frames
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings
-from rs_localizer.tools.simulation.true_motion import ConstantVelocity
+from rs_localizer.tools.simulation.true_motion import (
+    ConstantVelocity,
+    RecordedMotion,
+    sampled_states,
+)
 
 from .clouds import cloud_of
 
@@ -123,6 +129,28 @@ def test_a_lens_that_is_off_is_noticed_after_half_a_second(make_camera_info, ben
         if k < 14:
             assert notices == []
     assert {name for name, _ in notices} == told
+
+
+@pytest.mark.parametrize(("unit", "told"), [(1.0, ""), (1000.0, "millimetres"), (100.0, "centi")])
+def test_the_unit_of_a_map_is_named_before_its_lens(make_camera_info, unit, told):
+    """By a hand: priors hold tracked poses back, and what that leaves looks like a wrong lens."""
+    notices: list[tuple[str, str]] = []
+    frames = CameraFrames(
+        NodeConfig(readout_time=READOUT_TIME), lambda *words: notices.append(words)
+    )
+    frames.calibrate(read_camera_info(make_camera_info()))
+    motion = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
+    world = room(sampled_states(motion).positions, np.random.default_rng(0), count=3000)
+    stamps = [motion.intervals_ns[0][0] + round(5e9 + k * 1e9 / 30) for k in range(40)]
+    K = np.array([[500.0, 0.0, 319.5], [0.0, 510.0, 239.5], [0.0, 0.0, 1.0]])
+    camera = Camera(640, 480, K, readout_time=READOUT_TIME)
+    seen = FrameSettings(points=80, noise=0.5, outliers=0.0)
+    for frame in simulate_frames(camera, motion, world, seen, stamps_ns=stamps):
+        frames.localize(cloud_of(frame.stamp_ns, unit * frame.points, frame.pixels))
+    named = {name for name, _ in notices}
+    assert ("map_scale" in named) == bool(told)
+    assert named.isdisjoint({"lens", "stale_landmarks"})
+    assert all(f"is the map in {told}" in text for name, text in notices if name == "map_scale")
 
 
 def test_a_new_camera_counts_from_the_next_frame_on(make_camera_info):
