@@ -169,7 +169,7 @@ class Tracker:
         rig = localizer.rig
         alone = rig.exposure().ahead() if len(rig.cameras) == 1 else None
         self.lens = LensWatch(alone if self.shutter.watches else None, localizer.config)
-        self._integrity = Integrity(localizer.config.acceleration)
+        self._integrity = Integrity(localizer.config.acceleration, localizer.config.velocity_prior)
         self._parts = MovedParts(localizer.config.map_deviation)
         self._last_ns: int | None = None
         self._too_close = 0
