@@ -209,7 +209,7 @@ class Tracker:
         only.
         """
         newest = self._seen[-1].found if self._seen else None
-        return self._parts.part if newest and self.lens.is_beyond(newest) else None
+        return self._parts.named if newest and self.lens.is_beyond(newest) else None
 
     def mount(self, rig: Rig) -> None:
         """Set new mounts of the same cameras; the rig's axes stay the same."""
@@ -449,6 +449,9 @@ class Tracker:
             self._allow(self.lens.calibration)
             if self.lens.matrix is None:
                 self.shutter.add(time_ns, result, *seen, jumped=jumped)
+            doubtful = self.shutter.error or not self.shutter.trusted
+            if doubtful and self.remembers_motion:  # alone, frames may have any velocities
+                self._parts.discard()
         if result:
             result = self._judged(time_ns, result, points, prior)
             if pixels is not None:

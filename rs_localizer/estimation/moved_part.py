@@ -131,6 +131,8 @@ class MovedParts:
         """Forget all frames."""
         self.part: MovedPart | None = None
         """The part that was last found; None: the frames that were last compared show none."""
+        self.named: MovedPart | None = None
+        """The part that frames show together: one alone may have a cause of its own."""
         self._looks: list[Look] = []
         self._count, self._next = 0, 1
 
@@ -142,7 +144,7 @@ class MovedParts:
                 return
             self._next += min(self._count, _RARELY)
             if not alike():
-                self.part = None
+                self.part = self.named = None
                 return
         self._looks.append(look())
         if len(self._looks) in (1, _LOOKS):
@@ -150,8 +152,17 @@ class MovedParts:
             if found is not None or len(self._looks) == _LOOKS:
                 self.part = found
         if len(self._looks) == _LOOKS:
-            self._looks.clear()
-            self._next = self._count + min(self._count, _RARELY)
+            self.named = found
+            self._later()
+
+    def discard(self) -> None:
+        """Take nothing that was found for a part: the shutter is another one, or may be."""
+        self.part = self.named = None
+        self._later()
+
+    def _later(self) -> None:
+        self._looks.clear()
+        self._next = self._count + min(self._count, _RARELY)
 
 
 def neighbours_alike(observed: Observed, posterior: Posterior) -> bool:

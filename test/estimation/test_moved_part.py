@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from benchmarks import kinds
@@ -90,3 +91,23 @@ def test_a_camera_that_turns_on_the_spot_finds_the_part():
     own = {tuple(point) for point in part.points.tolist()}
     found = np.array([tuple(point) in own for point in told.tolist()])
     assert max(np.mean(found == half), np.mean(found == ~half)) > 0.9
+
+
+def test_a_global_shutter_is_no_part_of_a_map():
+    """A hand's, set to 30 ms: before that shows, rows are bent, and nothing is said of the map."""
+    K = np.array([[520.0, 0.0, 320.0], [0.0, 520.0, 240.0], [0.0, 0.0, 1.0]])
+    camera = rsl.Camera(640, 480, K, np.zeros(5), readout_time=0.03)
+    named = 0
+    for seed in range(6):
+        random = np.random.default_rng(seed)
+        tracker = Tracker(rsl.Localizer(camera))
+        points = random.uniform([-1.5, -1.2, 2.0], [1.5, 1.2, 4.0], (100, 3))
+        turning, going = random.normal(0.0, [[0.5], [0.3]], (2, 3))  # rad/s, m/s
+        for k in range(12):
+            t = k / 30.0
+            local = Rotation.from_rotvec(t * turning).apply(points) - t * going
+            pixels = local[:, :2] / local[:, 2:] * 520.0 + [320.0, 240.0]
+            noisy = pixels + random.normal(0.0, 0.5, pixels.shape)
+            tracker.localize(10**9 + round(1e9 * t), points, noisy)
+            named += tracker.moved is not None
+    assert named == 0
