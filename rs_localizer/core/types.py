@@ -132,7 +132,7 @@ class Estimate(Motion):
                 "a row time, neither seconds nor a row: camera.row_time(pixels) gives those of "
                 "pixels, result.at_time(seconds) goes beyond the rows, at_rows takes several"
             )
-        return self._at(tau)
+        return self._at(float(tau))
 
     def _at(self, tau: float) -> tuple[Array, Array]:
         # By the class: super() fails in a dataclass with slots, and self.at is overridden.
