@@ -394,6 +394,7 @@ def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterato
     last: Item | None = None
     for last in messages:
         topic, recorded_ns, message = last
+        localizer.take_zero_for_time(recorded_ns)
         for result in _each(inputs[topic].take_message(localizer, message)):
             yield answer(recorded_ns, message, result)
     for result in localizer.flush():

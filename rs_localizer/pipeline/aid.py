@@ -305,7 +305,7 @@ def in_camera_axes(
     camera, imu = frames
     if camera == imu:
         return samples
-    timed = transforms.moves(camera, imu)
+    timed = now_ns > 0 and transforms.moves(camera, imu)
     turn = transforms.lookup(camera, imu, now_ns if timed else None).rotation.T
     force = samples.specific_force
     return replace(

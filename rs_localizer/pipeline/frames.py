@@ -153,6 +153,10 @@ class FrameLocalizer(ABC):
         """Who says that scan direction or readout time are contradicted."""
         return self._tracker.shutter
 
+    def take_zero_for_time(self, recorded_ns: int) -> None:
+        """Take a stamp of 0 for a time where a recording has its message at 0, too."""
+        self._stream.zero_is_time = recorded_ns == 0
+
     def reset(self) -> None:
         """Forget the previous frames."""
         self._stream.reset()

@@ -43,7 +43,7 @@ class Mounting:
 
 
 def find_mounting(
-    transforms: Transforms, camera: str, base: str, stamp_ns: int, span_ns: int
+    transforms: Transforms, camera: str, base: str, stamp_ns: int | None, span_ns: int
 ) -> Mounting:
     """Return the mount at a time, from the transforms between two frames.
 
@@ -51,7 +51,7 @@ def find_mounting(
         transforms: where they come from.
         camera: optical frame of the camera.
         base: frame of the body.
-        stamp_ns: the moment.
+        stamp_ns: the moment; None: the latest.
         span_ns: of a mounting that moves, the velocity is that between half of this before and
             half of it after; 0: it is not asked for, and zero.
 
@@ -59,7 +59,7 @@ def find_mounting(
         TransformError: when the transform is not known for that time.
     """
     now = transforms.lookup(camera, base, stamp_ns)
-    if span_ns < 2 or not transforms.moves(camera, base):
+    if stamp_ns is None or span_ns < 2 or not transforms.moves(camera, base):
         return Mounting(now, np.zeros(3), np.zeros(3))
     half_ns = span_ns // 2
     before = transforms.lookup(camera, base, stamp_ns - half_ns)
@@ -110,7 +110,9 @@ def of_body(
     base = config.base_frame
     if base in ("", localized.body_frame):
         return localized
-    stamp_ns = localized.stamp_ns
+    # Without a time the latest transform is used, as everywhere in TF.
+    timed = min(localized.input_stamp_ns, localized.stamp_ns) > 0
+    stamp_ns = localized.stamp_ns if timed else None
     span_ns = round(localized.estimate.span * 1e9) if localized.twist else 0
     try:
         mounting = find_mounting(transforms, localized.body_frame, base, stamp_ns, span_ns)
@@ -146,8 +148,19 @@ class Broadcast:
     parent_from_child: Transform
 
 
+def _check_time(frame: Localized) -> None:
+    """Raise ``TransformError`` for a frame that says nothing of its time."""
+    if frame.input_stamp_ns == 0:
+        raise TransformError("header.stamp of the input is zero: the pose has no time for TF")
+
+
 def pose_transform(frame: Localized) -> Broadcast:
-    """Return the transform that is a frame's pose."""
+    """Return the transform that is a frame's pose.
+
+    Raises:
+        TransformError: when the frame says nothing of its time.
+    """
+    _check_time(frame)
     map_from_body = Transform(frame.pose.rotation, frame.pose.position)
     return Broadcast(frame.stamp_ns, frame.map_frame, frame.body_frame, map_from_body)
 
@@ -156,8 +169,10 @@ def pose_in_odometry(frame: Localized, config: NodeConfig, transforms: Transform
     """Return a frame's pose with the odometry at its time, for :func:`.decide`.
 
     Raises:
-        TransformError: when odometry says nothing for its time, or the map is odometry's own frame.
+        TransformError: when the frame says nothing of its time, or odometry says nothing for it, or
+            the map is odometry's own frame.
     """
+    _check_time(frame)
     if frame.map_frame == config.odom_frame:
         raise TransformError(f"the points are in {frame.map_frame!r}, which is odom_frame")
     odom_from_body = transforms.lookup(config.odom_frame, frame.body_frame, frame.stamp_ns)
@@ -172,7 +187,7 @@ def broadcast(
     """Return the transform to publish of a frame, if any, and the next state of ``map -> odom``.
 
     Raises:
-        TransformError: when odometry says nothing for its time.
+        TransformError: when the frame says nothing of its time, or odometry says nothing for it.
     """
     if config.publish_tf == PublishTf.NONE:
         return None, state

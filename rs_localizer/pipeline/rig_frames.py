@@ -327,7 +327,7 @@ class RigFrames(FrameLocalizer):
 
     def _mount(self, images: Sequence[CameraImage]) -> Refusal | None:
         """Look up where cameras are that move; why one of this frame is not known."""
-        frame, stamp_ns = self.camera_frame, images[0].cloud.stamp_ns
+        frame, stamp_ns = self.camera_frame, images[0].cloud.stamp_ns or None
         mounts, refusal = dict(self._mounts), None
         for image in images:
             name = image.camera

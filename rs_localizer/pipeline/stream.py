@@ -38,6 +38,7 @@ class Stream:
 
     def __init__(self, notice: Notify, forget: Callable[[], None]) -> None:
         self._notice, self._forget = notice, forget
+        self.zero_is_time = False  # a recording's clock starts at 0: elsewhere nobody set a stamp
         self.reset()
 
     def reset(self) -> None:
@@ -48,7 +49,7 @@ class Stream:
 
     def unset(self, stamp_ns: int) -> Refusal | None:
         """Refuse an image whose sender gives no time."""
-        if stamp_ns:
+        if stamp_ns or self.zero_is_time:
             return None
         return Refusal(Reason.NO_STAMP, "header.stamp is 0: its sender does not set it")
 

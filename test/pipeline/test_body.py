@@ -188,6 +188,7 @@ def localize(
             **({"readout_time": READOUT_TIME, "base_frame": "base_link"} | settings)
         )
         frames = CameraFrames(config, transforms=transforms)
+        frames.take_zero_for_time(recorded_ns=0)
         frames.calibrate(
             read_camera_info(make_camera_info(**({} if roi is None else {"roi": roi})))
         )
@@ -334,3 +335,18 @@ def test_a_missing_transform_refuses_the_frame_only(localize):
         )
         expected = chain.map_from_base(estimate(), 5.0)
         assert np.allclose(frame.pose.position, expected[:3, 3], atol=1e-12)
+
+
+@pytest.mark.parametrize("pose_time", list(PoseTime))
+def test_a_stamp_of_zero_in_a_recording_that_starts_there(localize, robot, pose_time):
+    # The mounting is the latest, the pose goes out, and TF, which needs a time, gets nothing.
+    robot.add(tf("base_link", "mast", matrix([9.0, 0.0, 0.0], np.eye(3)), 7.0), static=False)
+    robot.add(tf("base_link", "mast", BASE_FROM_MAST, 8.0), static=False)
+    expected = localized(localize(robot, stamp=(8, 0), readout_time=0.0))
+    settings = {"readout_time": 0.0, "pose_time": pose_time, "stamp_offset": -0.01}
+    frame, config = localize(robot, stamp=(0, 0), publish_tf="map_to_camera", **settings)
+    if pose_time == PoseTime.STAMP:
+        assert np.allclose(frame.pose.position, expected.pose.position, atol=1e-12)
+    assert frame.stamp_ns == (0 if pose_time == PoseTime.STAMP else -10_000_000)
+    with pytest.raises(TransformError, match=r"header.stamp of the input is zero"):
+        broadcast(frame, config, robot, CorrectionState())

@@ -56,6 +56,10 @@ def test_a_stamp_of_zero_is_none_and_ends_no_track():
         None, "no_stamp", None, "no_stamp", "repeated_stamp",
     ]  # fmt: skip
     assert (heard.forget.call_count, heard.notices) == (0, [])
+    # Of a recording that starts at 0 it is a time like any other.
+    heard = Heard()
+    heard.stream.zero_is_time = True
+    assert [heard.reason(s) for s in (0.0, 0.0, 0.1)] == [None, "repeated_stamp", None]
 
 
 @pytest.mark.parametrize(
