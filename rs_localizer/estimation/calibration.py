@@ -151,7 +151,7 @@ def calibration_effect(
     covariance, left = _effect(
         every, (first, tracked), of_speeds, terms, state, variance, rotation is not None
     )
-    if not np.isfinite(covariance).all():
+    if not (np.isfinite(covariance).all() and np.isfinite(left).all()):
         return NO_EFFECT._replace(still_deviation=still)
     residual = math.sqrt(max(float(left[:declared].sum()), 0.0) / (2.0 * found))
     return CalibrationEffect(covariance, residual, still)
