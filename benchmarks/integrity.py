@@ -31,7 +31,7 @@ from scipy.optimize import minimize
 from tqdm import tqdm
 
 from rs_localizer import integrity
-from rs_localizer.config import Acceleration, VelocityPrior
+from rs_localizer.config import Acceleration
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
@@ -185,7 +185,7 @@ def sequence(number: int, kinds: Sequence[str] = KINDS, scene: str = "whole") ->
     world, later = view.world, changed(kind, view.world, rng)
     if matcher == "markers" and kind in ("moved", "stale", "another"):  # whole ones
         later = world + np.tile((later - world).reshape(4, -1, 3).mean(axis=0), (4, 1))
-    tracker, judge = Tracker(Localizer(CAMERA)), Integrity(Acceleration(), VelocityPrior())
+    tracker, judge = Tracker(Localizer(CAMERA)), Integrity(Acceleration())
     person = rng.random() < 0.4 and scene != "board"
     centre, size = rng.uniform([0.0, 0.0], [640.0, 480.0]), rng.uniform(50.0, 170.0)
     drift = rng.normal(0.0, 25.0, 2)
@@ -227,7 +227,7 @@ def sequence(number: int, kinds: Sequence[str] = KINDS, scene: str = "whole") ->
 
 def recursive(rows: list[Row]) -> Array:
     """The integrity of each frame."""
-    found, judge, last = [], Integrity(Acceleration(), VelocityPrior()), ("", -1)
+    found, judge, last = [], Integrity(Acceleration()), ("", -1)
     for row in rows:
         if row.sequence != last:
             judge.reset()

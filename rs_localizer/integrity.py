@@ -20,10 +20,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rs_localizer.config import Acceleration, VelocityPrior
+from rs_localizer.config import Acceleration
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
-from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import POSE, TURN
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.prior import Prior
@@ -79,19 +78,21 @@ def _spread(kept: Array, every: Array) -> float:
     return min(max(0.5 * math.log(inner / outer), -3.0), 1.0)
 
 
-def _innovation(estimate: Estimate, motion: Motion, spread: Array) -> float:
+def _innovation(estimate: Estimate, prior: Prior, added: Array) -> float:
     """Return ``log(1 + d / 6)``, d the squared distance of the pose from its prediction.
 
-    ``spread`` (6,6) is the covariance of the prediction.
+    ``added`` (6,6) is covariance beside the prediction's.
     """
-    spread = spread + estimate.covariance[:6, :6]
+    if prior.motion is None or prior.covariance is None:
+        return 0.0
+    spread = np.asarray(prior.covariance)[:6, :6] + estimate.covariance[:6, :6] + added
     if not np.isfinite(spread).all():
         return 0.0
-    turn = so3.log(np.ascontiguousarray(motion.rotation @ estimate.rotation.T))
-    centre = -motion.rotation.T @ motion.translation
+    turn = so3.log(np.ascontiguousarray(prior.motion.rotation @ estimate.rotation.T))
+    centre = -prior.motion.rotation.T @ prior.motion.translation
     off = np.zeros(6)
     off[TURN] = turn
-    off[3:] = motion.rotation @ (estimate.position - centre)
+    off[3:] = prior.motion.rotation @ (estimate.position - centre)
     return min(math.log1p(float(off @ np.linalg.solve(spread, off)) / 6.0), 6.0)
 
 
@@ -136,15 +137,12 @@ class Integrity:
     """The chance that a track is wrong, frame by frame.
 
     Args:
-        acceleration, speed: of which cameras are capable. What they explain is no jump of the map,
-            however calmly the camera moved before, or whatever rows said of its velocity.
+        acceleration: of which cameras are capable. What it explains is no jump of the map, however
+            calmly the camera moved before it was out of sight.
     """
 
-    def __init__(self, acceleration: Acceleration, speed: VelocityPrior) -> None:
+    def __init__(self, acceleration: Acceleration) -> None:
         self._acceleration = acceleration
-        self._capable = [
-            np.repeat([each.angular, each.linear], 3) ** 2 for each in (acceleration, speed)
-        ]
         self._seen = SeenLandmarks()
         self.reset()
 
@@ -153,7 +151,6 @@ class Integrity:
         # Probabilities of the three states after the last frame.
         self._chances = np.array([1.0 - sum(FIRST), *FIRST])
         self._is_first = True
-        self._last: list[tuple[Estimate, float]] = []  # poses, and seconds since those before
 
     def stale(self, points: ArrayLike) -> BoolArray:
         """Return which landmarks (n,3) were seen too often to be unmatched by chance."""
@@ -172,8 +169,8 @@ class Integrity:
         """
         innovation = 0.0
         if prior is not None:
-            innovation = self._jump(estimate, prior, seconds)
-        self._last = [*self._last[-1:], (estimate, seconds)]
+            added = acceleration_covariance(self._acceleration, seconds, estimate.span)
+            innovation = _innovation(estimate, prior, added[POSE, POSE])
         usable = np.isfinite(np.asarray(estimate.residuals))
         every, kept = np.asarray(points, float)[usable], np.asarray(estimate.inliers)[usable]
         self._seen.add(_keys(every), kept)
@@ -187,28 +184,6 @@ class Integrity:
                 innovation,
             ]
         )
-
-    def _jump(self, estimate: Estimate, prior: Prior, seconds: float) -> float:
-        """Return how far a pose is from its prediction, and from where the last poses lead."""
-        if prior.motion is None or prior.covariance is None:
-            return 0.0
-        added = acceleration_covariance(self._acceleration, seconds, estimate.span)[POSE, POSE]
-        far = _innovation(estimate, prior.motion, np.asarray(prior.covariance)[POSE, POSE] + added)
-        if not self._last:
-            return far
-        # After rest, and in the first frames, velocities may be predicted too surely.
-        (last, before), acceleration, speed = self._last[-1], *self._capable
-        turn, way, more = np.zeros(3), np.zeros(3), speed * seconds**2
-        spread = last.covariance[POSE, POSE]
-        if len(self._last) > 1 and before > 0.0:
-            first, ratio = self._last[0][0], seconds / before
-            turn = ratio * so3.log(np.ascontiguousarray(last.rotation @ first.rotation.T))
-            way = ratio * (last.position - first.position)
-            spread = (1.0 + ratio) ** 2 * spread + ratio**2 * first.covariance[POSE, POSE]
-            more = acceleration * (0.5 * seconds * (seconds + before)) ** 2
-        rotation = so3.exp(turn) @ last.rotation
-        ahead = Motion(rotation, -rotation @ (last.position + way), np.zeros(3), np.zeros(3))
-        return min(far, _innovation(estimate, ahead, spread + np.diag(more)))
 
     def add(self, numbers: Array) -> float:
         """Return the probability that the pose is wrong, after a frame with these numbers (4,)."""

@@ -169,7 +169,7 @@ class Tracker:
         rig = localizer.rig
         alone = rig.exposure().ahead() if len(rig.cameras) == 1 else None
         self.lens = LensWatch(alone if self.shutter.watches else None, localizer.config)
-        self._integrity = Integrity(localizer.config.acceleration, localizer.config.velocity_prior)
+        self._integrity = Integrity(localizer.config.acceleration)
         self._parts = MovedParts(localizer.config.map_deviation)
         self._last_ns: int | None = None
         self._too_close = 0
@@ -286,7 +286,7 @@ class Tracker:
         own = track.estimate.span
         share = self._readout_time_deviation(context) / own
         window = replace(track.window, readout_share=share)
-        motion, covariance = window.after(time_ns).per_readout(own if span is None else span)
+        motion, covariance = window.foreseen(time_ns).per_readout(own if span is None else span)
         return predicted(motion, covariance + track.swing)
 
     def at(self, time_ns: int, readings: Any = None) -> Estimate | None:

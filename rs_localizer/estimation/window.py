@@ -20,6 +20,10 @@ tripod, of a hand and of a car are found within a few frames, from below and fro
 Real accelerations last longer than this model's, and those of noise end at once. So the next image
 is predicted by what fades soon, and the errors of a moment that no image shows are those of
 accelerations that last.
+
+Who rests may start at any time, before a scale can be learnt anew. So the motion is a mixture: in
+the last transitions accelerations are those that were learnt, or three or ten times as large, up to
+the settings'. Its mean and its region are weighed as those of one frame (docs/estimator.md).
 """
 
 from __future__ import annotations
@@ -48,6 +52,8 @@ from rs_localizer.core.state import (
     step_between,
 )
 from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.gaussian import Gaussians, mixture
+from rs_localizer.estimation.hypotheses import TEMPER
 from rs_localizer.estimation.prior import PriorTerms, add_prior, state_in
 from rs_localizer.estimation.robust import apply_step, inverted
 from rs_localizer.native import entry, kernel
@@ -73,6 +79,9 @@ _LEAST_CHANGE, _MOST_CHANGE, _ROUNDS = 0.2, 25.0, 2
 _SETTLED = 0.1
 # Of the configured deviations: a tripod's, and that of a blow.
 _LEAST_SCALE, _MOST_SCALE = 0.03, 100.0
+# Accelerations of the last transitions may be so many times as large as they were learnt. In the
+# mean, the logarithm of the odds that they are not: at 30 Hz one start in two seconds.
+_GROWN, _ODDS, _RECENT = (1.0, 3.0, 10.0), math.log(20.0), 3
 # Who turns about one axis turns a little about the others: of the largest deviation.
 _LEAST_SHARE = 0.3
 # Derivatives of a motion without its vibration by motion and coefficients.
@@ -124,6 +133,7 @@ class _Solved(NamedTuple):
     smoothed_covariances: Array  # (n+1,18,18)
     deviations: Array  # (4,) as they were learnt
     surprise: float  # squared distance of the last sample from its prediction
+    evidence: float  # logarithm, of all samples
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,6 +189,14 @@ class MotionWindow:
         row, found = len(self.samples) - frames, self.solved
         return Gaussian(self.times[row], found.smoothed[row], found.smoothed_covariances[row])
 
+    def foreseen(self, time_ns: int) -> Gaussian:
+        """Return the motion that an image at a time after the last frame may have.
+
+        Its accelerations may have grown: what the image tells joins the window without this.
+        """
+        deviations = enlarged(self.deviations, self.configured, _GROWN[-1])
+        return replace(self, deviations=deviations).after(time_ns)
+
     def after(self, time_ns: int, lasting: float = FADING) -> Gaussian:
         """Return the motion at a time after the last frame.
 
@@ -220,14 +238,29 @@ class MotionWindow:
         return replace(self, start=start, samples=samples)._through(_ROUNDS)
 
     def _through(self, rounds: int) -> MotionWindow:
-        """Return the window with the motion by its samples, learning from them in some rounds."""
+        """Return the window with the motion by its samples, learning from them in some rounds.
+
+        The filter, which goes on, is that of the accelerations that were learnt.
+        """
         _, states, informations, gradients = map(np.array, zip(*self.samples, strict=True))
         seconds: Array = np.diff(self.times).astype(np.float64) * 1e-9
-        solved = _Solved(*_solve(
-            seconds, states, informations, gradients, self.start.state,
-            self.start.covariance, np.stack([self.configured, self.deviations]),
-            self.readout_share, rounds,
-        ))  # fmt: skip
+        scales: Array = np.stack([self.configured, self.deviations])
+        found = list[_Solved]()
+        for grown in _GROWN:
+            found.append(_Solved(*_solve(
+                seconds, states, informations, gradients, self.start.state,
+                self.start.covariance, scales, self.readout_share, 0 if found else rounds, grown,
+            )))  # fmt: skip
+            scales = np.stack([self.configured, found[0].deviations])
+        evidences, odds = np.array([one.evidence for one in found]), np.zeros(len(found))
+        solved, none, odds[0] = found[0], np.zeros((len(found), 0)), _ODDS
+        for row in range(len(solved.smoothed)):
+            parts = Gaussians(
+                np.array([one.smoothed[row] for one in found]), none,
+                np.array([one.smoothed_covariances[row] for one in found]), evidences,
+            )  # fmt: skip
+            whole = mixture(parts, odds, TEMPER)
+            solved.smoothed[row], solved.smoothed_covariances[row] = whole.state, whole.covariance
         return replace(self, deviations=solved.deviations, solved=solved)
 
 
@@ -314,14 +347,15 @@ def singer(seconds: float, fading: float) -> Array:
 @entry
 def _solve(
     seconds: Array1, states: Array2, informations: Array3, gradients: Array2, start: Array1,
-    start_covariance: Array2, scales: Array2, readout_share: float, rounds: int,
-) -> tuple[Array, Array, Array, Array, Array, float]:  # fmt: skip
+    start_covariance: Array2, scales: Array2, readout_share: float, rounds: int, grown: float,
+) -> tuple[Array, Array, Array, Array, Array, float, float]:  # fmt: skip
     """Filter, smoother and learnt deviations: the fields of :class:`_Solved`.
 
     Args:
         seconds: (n,) of each transition.
         scales: (2,4) deviations by the settings, and as they are known.
         rounds: of learning.
+        grown: factor of the deviations of the last transitions.
     """
     count, configured, deviations = len(seconds), scales[0], scales[1].copy()
     square, row = (count + 1, PARAMETERS, PARAMETERS), (count + 1, STATE_SIZE)
@@ -330,9 +364,11 @@ def _solve(
     covariances, spreads = np.empty(square), np.empty(square)
     filtered[0], covariances[0], surprise = start, start_covariance, 0.0
     while True:
+        evidence = 0.0
         for k in range(count):
+            own = enlarged(deviations, configured, grown if k >= count - _RECENT else 1.0)
             predicted[k], predictions[k], transports[k] = _predicted(
-                filtered[k], covariances[k], seconds[k], deviations, readout_share, FADING
+                filtered[k], covariances[k], seconds[k], own, readout_share, FADING
             )
             known, told = inverted(predictions[k]), informations[k]
             knowns[k], covariances[k + 1] = known, inverted(told + known)
@@ -343,6 +379,8 @@ def _solve(
             surprise = np.sum(moved * (known @ moved))
             twice = 2.0 * gradients[k]
             surprise += np.sum(step * (told @ step - twice))
+            volume = np.linalg.slogdet(known)[1] + np.linalg.slogdet(covariances[k + 1])[1]
+            evidence += 0.5 * (volume - surprise)
         smoothed[count], spreads[count] = filtered[count], covariances[count]
         scores, weight = np.zeros((4, 3)), 1.0
         for k in range(count - 1, -1, -1):
@@ -364,7 +402,14 @@ def _solve(
         deviations[:3] = np.maximum(deviations[:3], _LEAST_SHARE * deviations[:3].max())
         is_settled = np.max(np.abs(np.log(deviations / before))) < _SETTLED
         rounds = 0 if is_settled else rounds - 1
-    return filtered, covariances, smoothed, spreads, deviations, surprise
+    return filtered, covariances, smoothed, spreads, deviations, surprise, evidence
+
+
+@entry
+def enlarged(deviations: Array1, configured: Array1, grown: float) -> Array:
+    """Return deviations (4,) so many times as large, up to those of the settings."""
+    larger: Array = np.minimum(grown * deviations, np.maximum(deviations, configured))
+    return larger
 
 
 @kernel

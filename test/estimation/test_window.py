@@ -10,6 +10,7 @@ import rs_localizer as rsl
 from rs_localizer.config import Acceleration
 from rs_localizer.core.state import step_between
 from rs_localizer.core.types import Estimate
+from rs_localizer.estimation import window as window_module
 from rs_localizer.estimation.prior import Prior, motion_terms, with_motion
 from rs_localizer.estimation.robust import apply_step
 from rs_localizer.estimation.window import (
@@ -114,6 +115,13 @@ def dense(samples, deviations):
     ]
 
 
+@pytest.fixture
+def as_learnt(monkeypatch):
+    """Let accelerations be as large as they were learnt, which the dense form has."""
+    monkeypatch.setattr(window_module, "_GROWN", (1.0,))
+
+
+@pytest.mark.usefixtures("as_learnt")
 def test_it_is_least_squares_over_all_its_frames():
     rng = np.random.default_rng(0)
     path, _ = simulated(0.1 * HAND, LENGTH - 1, rng)
@@ -162,6 +170,7 @@ def test_deviations_hold_the_errors_of_every_lag():
         assert 8.0 < np.mean(found) < 18.0, lag
 
 
+@pytest.mark.usefixtures("as_learnt")
 def test_between_frames_it_passes_through_both_and_after_them_it_spreads():
     rng = np.random.default_rng(4)
     path, _ = simulated(0.5 * HAND, 5, rng)
