@@ -31,7 +31,7 @@ def alone():
         ("scale 20 %", "it turns 20 % too fast"),
         ("mount 10 deg", "its mount is 10 deg off"),
         ("late 40 ms", "its stamps are 40 ms late"),
-        ("step 15 ms", "its stamps stepped by 15 ms"),
+        ("step 15 ms", "its stamps stepped by 16 ms"),
         ("saturated", "saturated"),
     ],
 )
