@@ -29,7 +29,7 @@ the settings'. Its mean and its region are weighed as those of one frame (docs/e
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -153,8 +153,9 @@ class MotionWindow:
     configured: Array
     deviations: Array
     samples: tuple[MotionSample, ...] = ()
-    solved: _Solved | None = None
+    solved: tuple[_Solved, ...] = ()  # by accelerations: as learnt, and larger ones
     readout_share: float = 0.0
+    mixed: dict[int, Gaussian] = field(default_factory=dict)  # by row, those that were asked for
 
     @classmethod
     def begin(
@@ -177,17 +178,27 @@ class MotionWindow:
     @property
     def surprise(self) -> float:
         """Squared distance of the last frame's points from its prediction; chi-squared of 18."""
-        return 0.0 if self.solved is None else self.solved.surprise
+        return self.solved[0].surprise if self.solved else 0.0
 
     def __len__(self) -> int:
         return len(self.samples) + 1
 
     def before(self, frames: int) -> Gaussian:
         """Return the motion so many frames before the last one, given all frames."""
-        if self.solved is None:
+        if not self.solved:
             return self.start
-        row, found = len(self.samples) - frames, self.solved
-        return Gaussian(self.times[row], found.smoothed[row], found.smoothed_covariances[row])
+        row = len(self.samples) - frames
+        if row not in self.mixed:
+            odds = np.zeros(len(self.solved))
+            odds[0] = _ODDS
+            parts = Gaussians(
+                np.array([one.smoothed[row] for one in self.solved]), np.zeros((len(odds), 0)),
+                np.array([one.smoothed_covariances[row] for one in self.solved]),
+                np.array([one.evidence for one in self.solved]),
+            )  # fmt: skip
+            whole = mixture(parts, odds, TEMPER)
+            self.mixed[row] = Gaussian(self.times[row], whole.state, whole.covariance)
+        return self.mixed[row]
 
     def foreseen(self, time_ns: int) -> Gaussian:
         """Return the motion that an image at a time after the last frame may have.
@@ -231,8 +242,7 @@ class MotionWindow:
         """Return the window with one more frame, and with learnt accelerations."""
         start, samples = self.start, (*self.samples, sample)
         if len(samples) >= LENGTH:
-            assert self.solved is not None
-            first, solved = samples[0], self.solved
+            first, solved = samples[0], self.solved[0]
             start = Gaussian(first.time_ns, solved.filtered[1], solved.covariances[1])
             samples = samples[1:]
         return replace(self, start=start, samples=samples)._through(_ROUNDS)
@@ -252,16 +262,7 @@ class MotionWindow:
                 self.start.covariance, scales, self.readout_share, 0 if found else rounds, grown,
             )))  # fmt: skip
             scales = np.stack([self.configured, found[0].deviations])
-        evidences, odds = np.array([one.evidence for one in found]), np.zeros(len(found))
-        solved, none, odds[0] = found[0], np.zeros((len(found), 0)), _ODDS
-        for row in range(len(solved.smoothed)):
-            parts = Gaussians(
-                np.array([one.smoothed[row] for one in found]), none,
-                np.array([one.smoothed_covariances[row] for one in found]), evidences,
-            )  # fmt: skip
-            whole = mixture(parts, odds, TEMPER)
-            solved.smoothed[row], solved.smoothed_covariances[row] = whole.state, whole.covariance
-        return replace(self, deviations=solved.deviations, solved=solved)
+        return replace(self, deviations=found[0].deviations, solved=tuple(found), mixed={})
 
 
 @entry
