@@ -561,7 +561,10 @@ class Tracker:
                 return known.prior
         if track is None or track.window is None:
             return self.prediction(time_ns)
-        motion, covariance = track.window.newest.per_readout(track.estimate.span)
+        last = track.window.newest
+        if len(track.window) == 1:  # an image shows what it shows, however fast a camera may be
+            last = gaussian_of(track.estimate, track.time_ns)
+        motion, covariance = last.per_readout(track.estimate.span)
         return coasting(motion, covariance, 1e-9 * (time_ns - track.time_ns) / track.estimate.span)
 
     @property
