@@ -44,7 +44,8 @@ class RowRotations:
         self.rate = 0.0
         """Rate (rad per readout, rms) at which images are turned as wholes, or vibrate."""
         self.most = 0.0
-        """That rate if no other shutter, map or lens adds anything to it."""
+        """Rate (rad per readout, rms) of all rotations, as if neither shutter, map nor lens were
+        wrong."""
         self.is_certain = False
         """Whether a stabilizer turned the images."""
 

@@ -156,7 +156,7 @@ def test_odometry_is_that_of_the_body_in_the_map(flight, frames):
     )
     covariances = np.array([m.twist.covariance.reshape(6, 6) for m in odometry])
     # It changes its velocities less than the default of acceleration.* allows for.
-    assert 0.1 < squared(velocity, covariances) < 2.0
+    assert 0.15 < squared(velocity, covariances) < 2.0
 
 
 def vars_of(vector: SimpleNamespace) -> tuple[float, float, float]:
@@ -181,7 +181,7 @@ def test_px4_gets_the_same_in_its_axes(flight, frames):
         "velocity": column("velocity") - flight.linear[SETTLED] @ FLU_TO_FRD.T,
     }
     for name, error in errors.items():
-        assert 0.05 < np.mean(error**2 / column(f"{name}_variance")) < 2.0, name
+        assert 0.08 < np.mean(error**2 / column(f"{name}_variance")) < 2.0, name
     rates = column("angular_velocity") - flight.angular[SETTLED] @ FLU_TO_FRD.T
     assert np.median(np.abs(rates)) < np.deg2rad(5.0)
 
