@@ -35,6 +35,8 @@ _PACKAGE = "rs_localizer"
 _CONNECT_TIMEOUT = 5.0
 # Level of what Dask logs: what goes wrong is an outcome or an error.
 _SILENT = logging.CRITICAL + 1
+# Dask gives levels of their own to these; after Ctrl-C a client logs that its wait was cancelled.
+_LOGGERS = ("distributed", "distributed.client", "tornado.application")
 # Run by each worker. A terminal's Ctrl-C comes to all: this process ends for it, and ends the
 # others, which would log that their tasks were cancelled.
 _PRELOAD = f"""import logging, signal
@@ -124,7 +126,8 @@ def perform_all(
     import dask.config
     from distributed import Client, KilledWorker, LocalCluster, as_completed
 
-    logging.getLogger("distributed").setLevel(_SILENT)
+    for name in _LOGGERS:
+        logging.getLogger(name).setLevel(_SILENT)
     with contextlib.ExitStack() as stack:
         place: Any = scheduler
         if scheduler is None:
