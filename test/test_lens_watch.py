@@ -103,6 +103,26 @@ def moving_board(board: np.ndarray, moved: np.ndarray, seconds: float) -> np.nda
     return pixels
 
 
+def test_a_ceiling_that_is_seen_squarely_leaves_poses_as_sure_as_they_are():
+    """It hardly tells a focal length, which must not walk away from a right one, by its noise."""
+    random = np.random.default_rng(2)
+    camera = rsl.Camera(1280, 720, [[900, 0, 639.5], [0, 900, 359.5], [0, 0, 1]], readout_time=0.02)
+    board = np.column_stack([random.uniform(-2.5, 2.5, (60, 2)) * [1.0, 0.6], np.zeros(60)])
+    amplitudes = np.array([0.3, 0.2, 0.05, 0.003, 0.003, 0.2])
+    phases, claimed = random.uniform(0.0, 6.0, 6), []
+    tracker = Tracker(rsl.Localizer(camera))
+    for k in range(80):
+        moved = np.zeros((2, 6))
+        moved[0] = amplitudes * np.sin(2.0 * k / 30.0 + phases)
+        moved[1] = 2.0 * amplitudes * np.cos(2.0 * k / 30.0 + phases)
+        moved[0, 2] += 4.5
+        places = np.array([moved[0, :3], moved[0, 3:], moved[1, :3], moved[1, 3:]]).ravel()
+        pixels = moving_board(board, places, 0.0) + 0.5 * random.normal(size=(60, 2))
+        found = tracker.localize(k * 33_333_333, board, pixels)
+        claimed.append(np.sqrt(np.trace(found.covariance[3:6, 3:6])) if found else np.inf)
+    assert max(claimed[8:]) < 0.03  # m
+
+
 @pytest.mark.parametrize("lost", [False, True])
 def test_a_recording_with_gaps_shows_no_other_matrix(lost):
     """Stamps run on while the camera is elsewhere, or an image is lost: no parabola fits."""

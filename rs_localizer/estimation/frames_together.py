@@ -45,6 +45,7 @@ _KEPT, _KNOWN = 8, 0.02
 # more than this (with 4e-3 wrong lenses are told late). Each linearizes one three anew: that of
 # which poses, or shared numbers in units of the last, have moved most.
 _ROUNDS, _LEAST_STEP, _NEAR = 8, 1e-3, (0.3, 0.05, 0.02)
+_EXACT_ROUNDS = 5  # of all threes, three of which are enough before ceilings
 _LEAST_NOISE = 0.1  # px, no real error is smaller
 # So many threes in a row that do not fit those before are no chance.
 _ODD = 2
@@ -314,11 +315,17 @@ class _Fit(NamedTuple):
 
     numbers: Array  # (11,)
     deviations: Array  # (11,)
-    variance: float  # px^2
-    cost: float
+    wider: float  # by which they are larger than the equations say
+    squared_errors: Array  # (n,) px^2
+    unlikely: float  # squares of what is known beforehand, over its variances
 
+    @property
+    def variance(self) -> float:
+        return _variance(self.squared_errors)
 
-_NO_FIT = _Fit(np.zeros(_SHARED), np.zeros(_SHARED), math.inf, math.inf)
+    def cost(self, variance: float) -> float:
+        """Return minus twice the logarithm of the likelihood, for this variance (px^2)."""
+        return self.unlikely + 9.0 * float(np.log1p(self.squared_errors / (9.0 * variance)).sum())
 
 
 class FramesTogether:
@@ -370,6 +377,8 @@ class FramesTogether:
             if not (threes and self._fits(fit, threes)):  # it leaves more than frames do
                 return
         self._odd = 0
+        if self._beyond(fit, _DOUBTFULLY).any():
+            fit, threes, principal = self._beside_k(fit, threes, principal)
         self._threes, self._fit, self._principal = threes, fit, principal
         if len(threes) > _KEPT:
             del self._threes[self._least()]
@@ -390,18 +399,37 @@ class FramesTogether:
         beyond: Array = np.sqrt(np.maximum(squared, 0.0)) * (abs(longer + aspect) < most)
         return beyond
 
+    def _beside_k(
+        self, fit: _Fit, threes: list[_Three], principal: Array
+    ) -> tuple[_Fit, list[_Three], Array]:
+        """Return a fit, or that with K, if K explains the same threes as well.
+
+        Before a plane that is seen squarely a focal length walks away, three by three, and seems
+        to be known where it has come to, not where it should be.
+        """
+        assert self._map is not None
+        known, start = self._known.copy(), fit.numbers.copy()
+        known[_OF_K], start[_OF_K] = self._usual**-2.0, 0.0
+        given = [_Three(self._exposure, three.posed, self._map, 0.0) for three in threes]
+        with_k = self._fitted(given, start, np.zeros(2), known)
+        fit = self._fitted(threes, fit.numbers, principal, self._known)
+        variance = max(fit.variance, self._least_variance(threes))
+        worse = with_k.cost(variance) - fit.cost(variance)
+        if worse > (_DOUBTFULLY * fit.wider) ** 2:
+            return fit, threes, principal
+        return with_k, given, np.zeros(2)
+
     def _from_anywhere(self, posed: Sequence[Sequence[Fitted]]) -> tuple[_Fit, list[_Three], Array]:
         """Return a fit from other focal lengths, as each frame may hide what is wrong."""
         assert self._map is not None
-        camera, best = self._exposure.cameras[0], (_NO_FIT, list[_Three](), np.zeros(2))
+        camera, fits = self._exposure.cameras[0], list[tuple[_Fit, list[_Three], Array]]()
         for principal in (np.zeros(2), centre_of(camera) / camera.focal_length):
             for length in (0.0, *map(math.log, _LENGTHS)):
                 threes = [_Three(self._exposure, each, self._map, length) for each in posed]
                 start = length * np.eye(_SHARED)[_LENGTH]
-                fit = self._fitted(threes, start, principal)
-                if fit.cost < best[0].cost:
-                    best = fit, threes, principal
-                if best[1] and self._fits(*best[:2]):
+                fits.append((self._fitted(threes, start, principal), threes, principal))
+                best = min(fits, key=lambda each: each[0].cost(self._least_variance(threes)))
+                if self._fits(*best[:2]):
                     return best
         return best
 
@@ -416,21 +444,28 @@ class FramesTogether:
         of_map = self._map_deviation * self._exposure.cameras[0].focal_length / threes[-1].depth
         return float(_LEAST_NOISE**2 + of_map**2)
 
-    def _fitted(self, threes: Sequence[_Three], start: Array, principal: Array) -> _Fit:
-        """Return the fit of all threes, which move there."""
-        numbers, known, least = start, self._known, self._least_variance(threes)
+    def _fitted(
+        self, threes: Sequence[_Three], start: Array, principal: Array, exactly: Array | None = None
+    ) -> _Fit:
+        """Return the fit of all threes, which move there.
+
+        ``exactly`` (11,): information that counts instead of what is known before any frame; all
+        threes are linearized anew in each round, so that costs can be compared.
+        """
+        numbers, least = start, self._least_variance(threes)
+        known = self._known if exactly is None else exactly
         covariance: Array = np.diag(1.0 / known)
         new = [three for three in threes if three.equations is None]
         for three in new:
             three.linearize(numbers, principal, least)
-        for _ in range(_ROUNDS * len(new)):
+        for _ in range(_ROUNDS * len(new) if exactly is None else _EXACT_ROUNDS):
             information: Array = np.diag(known)
             slope = known * numbers
             for there in (three.equations for three in threes if three.equations):
                 information = information + there.information
                 slope = slope + there.slope + there.information @ (numbers - there.numbers)
             try:
-                covariance[:] = np.linalg.inv(information)
+                covariance[:] = np.linalg.inv(information + np.diag(self._known - known))
                 step = -np.linalg.solve(information + _DAMPING, slope)
             except np.linalg.LinAlgError:
                 break
@@ -438,17 +473,20 @@ class FramesTogether:
             if not math.isfinite(farthest):
                 break
             numbers = numbers + step * min(1.0, _MOST_STEP / farthest)
+            if exactly is not None:
+                for three in threes:
+                    three.linearize(numbers, principal, least)
+                continue
             stalest = max(threes, key=partial(_Three.staleness, numbers=numbers))
             if stalest.staleness(numbers) > 1.0:
                 stalest.linearize(numbers, principal, least)
             elif farthest < _LEAST_STEP:
                 break
         linear = [three.equations for three in threes if three.equations]
-        squared = [there.squared_errors for there in linear]
-        variance = _variance(np.concatenate(squared))
-        cost = sum(float(np.log1p(each / (9.0 * least)).sum()) for each in squared)
+        squared = np.concatenate([there.squared_errors for there in linear])
         wider = _ALIKE * _disagreement(linear, numbers)
-        return _Fit(numbers, wider * np.sqrt(np.diag(covariance)), variance, cost)
+        unlikely = known @ numbers**2 + sum(three.known @ three.own**2 for three in threes)
+        return _Fit(numbers, wider * np.sqrt(np.diag(covariance)), wider, squared, float(unlikely))
 
     def _least(self) -> int:
         """Return the three without which the focal length is known best."""
