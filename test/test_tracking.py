@@ -98,6 +98,18 @@ def test_tracking_improves_weak_frames(points, count):
     assert np.mean(tracked[1:]) > 0.95
 
 
+def test_poses_are_as_sure_wherever_the_origin_of_the_map_is():
+    """Coordinates of UTM are thousands of kilometres."""
+    hand, sure = Hand(), []
+    for origin in (np.zeros(3), np.array([5e5, 5e6, 300.0])):
+        tracker = Tracker(rsl.Localizer(CAMERA))
+        for t in times(4):
+            points, pixels = hand.frame(t, 100)
+            result = tracker.localize(ns(t), points + origin, pixels)
+        sure.append(np.sqrt(np.diag(result.covariance)))
+    np.testing.assert_allclose(sure[1], sure[0], rtol=0.05)
+
+
 class Car(Hand):
     """Drives straight on at 13 m/s, four times what settings expect, and hardly turns."""
 

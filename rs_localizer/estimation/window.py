@@ -47,6 +47,7 @@ from rs_localizer.core.state import (
     STATE_ANGULAR,
     STATE_ANGULAR_ACCELERATION,
     STATE_SIZE,
+    STATE_TRANSLATION,
     TURN,
     rotation_of,
     step_between,
@@ -191,12 +192,18 @@ class MotionWindow:
         if row not in self.mixed:
             odds = np.zeros(len(self.solved))
             odds[0] = _ODDS
+            # From where the camera is: a map's origin may be thousands of kilometres away.
+            states = np.array([one.smoothed[row] for one in self.solved])
+            centre = -rotation_of(states[0]).T @ states[0, STATE_TRANSLATION]
+            for state in states:
+                state[STATE_TRANSLATION] += rotation_of(state) @ centre
             parts = Gaussians(
-                np.array([one.smoothed[row] for one in self.solved]), np.zeros((len(odds), 0)),
+                states, np.zeros((len(odds), 0)),
                 np.array([one.smoothed_covariances[row] for one in self.solved]),
                 np.array([one.evidence for one in self.solved]),
             )  # fmt: skip
             whole = mixture(parts, odds, TEMPER)
+            whole.state[STATE_TRANSLATION] -= rotation_of(whole.state) @ centre
             self.mixed[row] = Gaussian(self.times[row], whole.state, whole.covariance)
         return self.mixed[row]
 
