@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import pytest
 from recorded import record
-from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.commands import main
 from rs_localizer.core.camera import Camera
@@ -22,8 +21,6 @@ from rs_localizer.io.camera_files import lens_parameters
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.trajectories import read_motions
-from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.settings import load_params_file, write_camera_file
 
 TURN = ("--angular-velocity", "0.5", "-1", "2", "--linear-velocity", "0.2", "0", "0")
@@ -70,9 +67,14 @@ def test_bag_holds_frames_and_their_truth(tmp_path, topic, words):
         assert cv2.imdecode(frames[0].data, cv2.IMREAD_UNCHANGED).shape == (480, 640)
 
 
-def test_the_next_command_has_the_shutter(tmp_path, monkeypatch, capsys):
+def test_lens_and_shutter_of_a_file_go_on_to_the_next_command(tmp_path, monkeypatch, capsys):
+    """An option takes one of them back."""
     monkeypatch.chdir(tmp_path)
-    words = ("--readout-time", "0.025", "--scan-direction", "bottom_to_top", "--duration", "0.2")
+    K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+    lens = Camera(640, 480, K, [-0.2, 0.05, 0.001, -0.001])
+    shutter = {"readout_time": 0.025, "scan_direction": "left_to_right"}
+    write_camera_file(Path("camera.yaml"), shutter, lens_parameters(lens))
+    words = ("--camera", "camera.yaml", "--scan-direction", "bottom_to_top", "--duration", "0.2")
     assert simulate(Path("my bag"), *words) == 0
     *_, line = capsys.readouterr().out.splitlines()
     label, program, *command = shlex.split(line)
@@ -81,61 +83,11 @@ def test_the_next_command_has_the_shutter(tmp_path, monkeypatch, capsys):
         "readout_time": 0.025,
         "scan_direction": "bottom_to_top",
     }
+    with open_bag(Path("my bag")) as bag:
+        info = read_camera_info(next(m for _, _, m in bag.messages(["/camera_info"])))
+    assert info.D[:4] == tuple(lens.D)
     assert main(command) == 0
     assert main(["evaluate", "my bag_poses", "my bag"]) == 0
-
-
-def test_markers_are_where_map_and_truth_put_them(tmp_path):
-    """Each corner projected at the time of its own line, by the pose and twist in the bag.
-
-    Lens and shutter are those of one file, of which an option takes one back.
-    """
-    file, D = tmp_path / "camera.yaml", np.array([-0.2, 0.05, 0.001, -0.001])
-    K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
-    shutter = {"readout_time": 0.03, "scan_direction": "left_to_right"}
-    write_camera_file(file, shutter, lens_parameters(Camera(640, 480, K, D)))
-    words = ("--images", *TURN, "--camera", str(file), "--duration", "0.1")
-    words += ("--scan-direction", "right_to_left")
-    noise = ("--exposure", "0.002", "--noise", "1")
-    assert simulate(tmp_path / "bag", *words, *noise) == 0
-    corners = {m.id: m.corners for m in read_marker_map(tmp_path / "bag/marker_map.yaml").markers}
-    truth = read_motions(tmp_path / "bag", "/truth/pose", "/truth/twist")
-    assert truth.twists is not None
-    with open_bag(tmp_path / "bag") as bag:
-        info = next(m for _, _, m in bag.messages(["/camera_info"]))
-        images = [m for _, _, m in bag.messages(["/image_raw/compressed"])]
-    camera = read_camera_info(info).camera(0.03, "right_to_left")
-    errors = []
-    for message in images:
-        row = truth.poses.stamps_ns.tolist().index(stamp_ns(message))
-        for number, seen in detect(cv2.imdecode(message.data, cv2.IMREAD_GRAYSCALE)).items():
-            late = 0.03 * (1 - seen[:, :1] / 639)
-            start = Rotation.from_quat(truth.poses.quaternions[row])
-            turned = start * Rotation.from_rotvec(late * truth.twists.angular[row])
-            travel = late * start.apply(truth.twists.linear[row])
-            local = corners[number] - truth.poses.positions[row] - travel
-            errors.append(seen - camera.project(turned.inv().apply(local)))
-    offsets = np.concatenate(errors)
-    assert len(offsets) > 60
-    assert np.median(np.linalg.norm(offsets, axis=1)) < 0.4
-    assert np.abs(np.median(offsets, axis=0)).max() < 0.05
-
-
-def detect(image: np.ndarray) -> dict[int, np.ndarray]:
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
-    if hasattr(cv2.aruco, "ArucoDetector"):
-        corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(image)
-    else:  # OpenCV 4.6
-        corners, ids, _ = cv2.aruco.detectMarkers(image, dictionary)
-    found = {}
-    for number, quad in zip(ids.ravel(), corners, strict=True):
-        # A window on the scale of the marker, so that it holds no other corner.
-        window = int(np.clip(np.linalg.norm(quad[0] - quad[0, 1], axis=1).max() / 12, 2, 5))
-        refined = cv2.cornerSubPix(
-            image, np.array(quad[0][:, None]), (window, window), (-1, -1), (3, 30, 1e-3)
-        )
-        found[int(number)] = refined[:, 0].astype(np.float64)
-    return found
 
 
 def test_replay_uses_it_and_says_so(tmp_path, ran):

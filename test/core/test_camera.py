@@ -43,7 +43,8 @@ def pixels(count=200, seed=0):
         ((640, 480), (0.78, 1.04, 0.5, 0.5), r"not in pixels: focal lengths 0\.78, 1\.04, "),
         ((16, 16), (5.0, 5.0, 7.5, 7.5), ""),  # a wide lens on a small image
         ((640, 480), (500.0, 500.0, 0.5, 0.5), ""),  # a corner in the middle of the view
-        ((70_000, 480), (500.0, 500.0, 35_000.0, 240.0), "at most 65536 pixels wide and high, got"),
+        *((size, (500.0, 500.0, 0.5 * size[0], 0.5 * size[1]), "at most 65536 pixels wide and high")
+          for size in ((70_000, 480), (2**31, 480), (640, 2**31))),
     ],
 )  # fmt: skip
 def test_a_matrix_of_another_image_is_named(size, K, said):

@@ -19,7 +19,6 @@ import pytest
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagError, open_bag
 from rs_localizer.io.images import decode_image
 from rs_localizer.io.maps.files import read_map_file
@@ -135,7 +134,9 @@ def progressive(size: int) -> bytes:
 
 
 @pytest.mark.parametrize("image", [png(12_000, 1), png(8_000, 64), progressive(6_000)])
-def test_images_that_are_all_alike(image):
+def test_images_that_are_all_alike(image, monkeypatch):
+    """They are refused by their headers."""
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
     with pytest.raises(MessageError, match=r"says that it is (12000|8000|6000) x .*, too much for"):
         decode_image(image, "")
 
@@ -143,13 +144,6 @@ def test_images_that_are_all_alike(image):
 @pytest.mark.parametrize("image", [png(2_000, 1), png(1_900, 64), progressive(1_900)])
 def test_small_images_may_be_all_alike(image):
     assert not decode_image(image, "").any()
-
-
-@pytest.mark.parametrize("size", [(2**31, 480), (640, 2**31), (70_000, 480)])
-def test_images_of_no_camera(size):
-    K = [[500.0, 0.0, 0.5 * size[0]], [0.0, 500.0, 0.5 * size[1]], [0.0, 0.0, 1.0]]
-    with pytest.raises(ValueError, match="at most 65536 pixels wide and high, got"):
-        Camera(*size, K)
 
 
 @pytest.mark.parametrize("value", [-1e-6, -np.inf, np.inf])

@@ -179,37 +179,12 @@ def chunk(kind: bytes, body: bytes) -> bytes:
     return len(body).to_bytes(4) + kind + body + zlib.crc32(kind + body).to_bytes(4)
 
 
-def png_of(width: int, height: int, rows: bytes = b"") -> bytes:
-    """A gray PNG of these rows, packed."""
-    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    return PNG[:8] + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
-
-
-def test_a_small_file_of_many_pixels_is_refused_by_its_header(monkeypatch):
-    small = png_of(300, 200, zlib.compress(bytes(301 * 200)))
-    np.testing.assert_array_equal(
-        read_compressed_image(compressed(small)).pixels, np.zeros((200, 300))
-    )
-    bomb = png_of(20000, 20000, bytes(400_000))  # about what 20000 x 20000 zeros are packed to
-    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
-    with pytest.raises(MessageError, match=r"PNG image says that it is 20000 x 20000, .* megap"):
-        read_compressed_image(compressed(bomb))
-    tall = jpeg_of(20000, 20000) + bytes(3_000_000) + b"\xff\xd9"
-    with pytest.raises(MessageError, match="JPEG image says that it is 20000 x 20000"):
-        read_compressed_image(compressed(tall))
-
-
-def jpeg_of(width: int, height: int) -> bytes:
-    start = next(k for k in range(len(JPEG)) if JPEG[k : k + 2] == b"\xff\xc0")
-    size = height.to_bytes(2) + width.to_bytes(2)
-    return JPEG[: start + 5] + size + JPEG[start + 9 : -2]
-
-
 def test_an_animated_png_is_read_as_its_still_image():
     """OpenCV 5.0 ends the process by SIGSEGV; hence a process of its own."""
     rows = chunk(b"IDAT", zlib.compress((b"\0" + bytes(range(16))) * 12))
     control = struct.pack(">5I2H2B", 2, 8, 6, 3, 3, 1, 10, 0, 0)
-    animated = png_of(16, 12)[:33] + chunk(b"acTL", struct.pack(">II", 3, 0))
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 16, 12, 8, 0, 0, 0, 0))
+    animated = PNG[:8] + header + chunk(b"acTL", struct.pack(">II", 3, 0))
     animated += rows + chunk(b"fcTL", control) + rows + chunk(b"IEND", b"")
     program = (
         "import sys; from types import SimpleNamespace as N\n"

@@ -60,6 +60,14 @@ def test_values(frame):
         assert np.array_equal(message.covariance.reshape(6, 6), frame.twist.covariance)
 
 
+def test_a_pose_without_a_covariance_says_so(frame):
+    """As frames have whose samples nothing refines."""
+    none = dataclasses.replace(frame.pose, covariance=np.full((6, 6), np.nan))
+    made = messages(dataclasses.replace(frame, pose=none), make_message)
+    for message in (made["pose_with_covariance"], made["odometry"]):
+        assert np.array_equal(message.pose.covariance.reshape(6, 6), -np.eye(6))
+
+
 def test_without_a_twist_nothing_claims_one(frame):
     made = messages(dataclasses.replace(frame, twist=None), make_message)
     assert set(made) == {"pose", "pose_with_covariance", "inliers"}

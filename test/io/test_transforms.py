@@ -1,14 +1,15 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The frames of a recording: the same numbers as tf2, and what cannot be answered is said."""
+"""The frames of a recording: chains of transforms, and what cannot be answered is said."""
 
-from types import SimpleNamespace
+from types import SimpleNamespace as Made
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from rs_localizer.io.transforms import TransformError, TransformTree, from_numbers
+from rs_localizer.io.messages import make_header
+from rs_localizer.io.transforms import TransformError, TransformTree
 
 Numbers = tuple[float, ...]
 NAN = float("nan")
@@ -16,75 +17,61 @@ HALF_TURN = (0.0, 0.0, 1.0, 0.0)
 NO_TURN = (0.0, 0.0, 0.0, 1.0)
 
 
-def tf(parent: str, child: str, t: Numbers, q: Numbers, stamp_ns: int = 0) -> SimpleNamespace:
+def tf(parent: str, child: str, t: Numbers, q: Numbers, stamp_ns: int = 0) -> Made:
     """A TFMessage of one transform."""
-    stamped = SimpleNamespace(
-        header=SimpleNamespace(
-            stamp=SimpleNamespace(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9), frame_id=parent
-        ),
-        child_frame_id=child,
-        transform=SimpleNamespace(
-            translation=SimpleNamespace(**dict(zip("xyz", t, strict=True))),
-            rotation=SimpleNamespace(**dict(zip("xyzw", q, strict=True))),
-        ),
-    )
-    return SimpleNamespace(transforms=[stamped])
+    place, turn = (Made(**dict(zip("xyzw", values, strict=False))) for values in (t, q))
+    header = make_header(lambda _, **fields: Made(**fields), stamp_ns, parent)
+    transform = Made(translation=place, rotation=turn)
+    return Made(transforms=[Made(header=header, child_frame_id=child, transform=transform)])
+
+
+# Parent, translation and quaternion of each frame; of the base, at two times.
+STATIC = {
+    "mast": ("base", (0.4, 0.3, 0.9), (0.1, -0.2, 0.3, 0.927361849549570)),
+    "camera": ("mast", (0.0, 0.1, 0.25), (-0.5, 0.5, -0.5, 0.5)),
+    "/lidar": ("/base", (-0.2, 0.0, 1.3), (0.9, 0.1, -0.4, -0.141421356237309)),
+}
+LAST_NS = 1_033_333_333
+ODOMETRY = {
+    LAST_NS: ((1.1, 2.1, 0.1), (0.0, 0.1, -0.6, -0.793725393319377)),
+    10**9: ((1.0, 2.0, 0.1), (0.0, 0.0, 0.6, 0.8)),
+}
 
 
 @pytest.fixture
 def tree() -> TransformTree:
     tree = TransformTree()
-    for parent, child, t, q in (
-        ("base", "mast", (0.4, 0.3, 0.9), (0.1, -0.2, 0.3, 0.927361849549570)),
-        ("mast", "camera", (0.0, 0.1, 0.25), (-0.5, 0.5, -0.5, 0.5)),
-        ("/base", "/lidar", (-0.2, 0.0, 1.3), (0.9, 0.1, -0.4, -0.141421356237309)),
-    ):
+    for child, (parent, t, q) in STATIC.items():
         tree.add(tf(parent, child, t, q), static=True)
-    for t, q, stamp_ns in (
-        ((1.1, 2.1, 0.1), (0.0, 0.1, -0.6, -0.793725393319377), 1_033_333_333),
-        ((1.0, 2.0, 0.1), (0.0, 0.0, 0.6, 0.8), 1_000_000_000),
-    ):
+    for stamp_ns, (t, q) in ODOMETRY.items():
         tree.add(tf("odom", "base", t, q, stamp_ns), static=False)
     return tree
 
 
-# What tf2_ros.Buffer of geometry2 (branch jazzy, compiled by g++ 12 on x86-64) answers for the tree
-# above: translation x y z, rotation x y z w.
-OF_TF2 = [
-    ("base", "camera", None,
-     ("0x1.0ceccf10c8f41p-2 0x1.36eb486353472p-2 0x1.21ad1468c1667p+0 "
-     "-0x1.dacf2c1ebf387p-2 0x1.0e025f51f26b9p-2 "
-     "-0x1.7468c5b858d1fp-2 0x1.87012fa8f935dp-1")),
-    ("camera", "base", None,
-     ("0x1.4869ed381bd5cp-3 0x1.b01e32b5a6d3ep-1 -0x1.ad73f814b3092p-1 "
-     "0x1.dacf2c1ebf387p-2 -0x1.0e025f51f26b9p-2 "
-     "0x1.7468c5b858d1fp-2 0x1.87012fa8f935dp-1")),
-    ("lidar", "camera", None,
-     ("0x1.058f26dd8371ap-1 -0x1.95c243c5db8c6p-3 -0x1.7b9ed7defea10p-3 "
-     "0x1.61b62338b334cp-1 0x1.40bd30c22726cp-1 "
-     "-0x1.2bec9be4333f4p-4 0x1.69f4de5ba11bep-2")),
-    ("odom", "camera", 1012345678,
-     ("0x1.80895f396d818p-1 0x1.295b1a30633a5p+1 0x1.3aff8e8fc4167p+0 "
-     "-0x1.07c9073ebeb0dp-1 -0x1.8a5ebbfb2411dp-4 "
-     "0x1.357831c718c02p-3 0x1.ad1f2ce418002p-1")),
-    ("camera", "odom", 1000000000,
-     ("-0x1.771824254abc0p+0 0x1.7d056681c9c84p-2 -0x1.26d2a236d665ep+1 "
-     "0x1.0eed2e3e7b9d5p-1 0x1.138338dd2995dp-4 "
-     "-0x1.568e693b6197dp-3 0x1.a886c7d81536dp-1")),
-    ("odom", "base", None,
-     ("0x1.199999999999ap+0 0x1.0cccccccccccdp+1 0x1.999999999999ap-4 "
-     "0x0.0p+0 -0x1.999999999999cp-4 "
-     "0x1.3333333333334p-1 0x1.96632cbc9f77ep-1")),
-]  # fmt: skip
+def matrix(t: Numbers, q: Numbers) -> np.ndarray:
+    found = np.eye(4)
+    found[:3, :3], found[:3, 3] = Rotation.from_quat(q).as_matrix(), t
+    return found
 
 
-@pytest.mark.parametrize(("target", "source", "stamp_ns", "text"), OF_TF2)
-def test_the_same_as_tf2(tree, target, source, stamp_ns, text):
-    x, y, z, *quaternion = map(float.fromhex, text.split())
-    expected = from_numbers((x, y, z), tuple(quaternion))
-    found = tree.lookup(target, source, stamp_ns)
-    assert np.allclose(found.translation, expected.translation, rtol=0.0, atol=1e-14)
-    assert np.allclose(found.rotation, expected.rotation, rtol=0.0, atol=1e-14)
+@pytest.mark.parametrize("target", ["odom", "base", "camera", "lidar"])
+@pytest.mark.parametrize("stamp_ns", [None, 10**9, 1_012_345_678])
+def test_chains_are_products_of_matrices_in_both_directions(tree, target, stamp_ns):
+    """What tf2 itself says of such chains, test/real_ros compares."""
+    times = sorted(ODOMETRY)
+    places, turns = (np.array([ODOMETRY[time][k] for time in times]) for k in (0, 1))
+    now = LAST_NS if stamp_ns is None else stamp_ns
+    share = (now - times[0]) / (times[1] - times[0])
+    turn = Slerp([0.0, 1.0], Rotation.from_quat(turns))(share).as_quat()
+    in_odom = {"odom": np.eye(4)}
+    in_odom["base"] = matrix((1.0 - share) * places[0] + share * places[1], turn)
+    for child, (parent, t, q) in STATIC.items():
+        in_odom[child.strip("/")] = in_odom[parent.strip("/")] @ matrix(t, q)
+    for source, placed in in_odom.items():
+        expected = np.linalg.inv(in_odom[target]) @ placed
+        found = tree.lookup(target, source, stamp_ns)
+        np.testing.assert_allclose(found.rotation, expected[:3, :3], atol=1e-14)
+        np.testing.assert_allclose(found.translation, expected[:3, 3], atol=1e-14)
 
 
 def test_what_moves(tree):
