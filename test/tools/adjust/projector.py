@@ -1,19 +1,32 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A rolling-shutter camera of the tests' own: nothing of it is the package's code.
+"""Recordings of a hand for the tests of tools, by the camera of the independent simulator.
 
-Motion: sums of sines in each of three rotation angles and three coordinates. Lens: pinhole with
-radial and tangential distortion. The row of each point is found by bisection.
+Motion: sums of sines in each of three rotation angles and three coordinates.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-WIDTH, HEIGHT, FOCAL = 640, 480, 420.0
-K = np.array([[FOCAL, 0.0, 321.3], [0.0, FOCAL + 3.0, 236.8], [0.0, 0.0, 1.0]])
-D = np.array([-0.12, 0.04, 0.001, -0.0015, 0.0])
+from benchmarks.independent.cameras import Camera as TrueCamera
+from benchmarks.independent.cameras import Scan
+from rs_localizer.core.camera import Camera
+
+
+class Lens(TrueCamera):
+    centre = np.array([321.3, 236.8])
+
+
+TRUE = Lens(distortion=(-0.12, 0.04, 0.001, -0.0015, 0.0))
+# Along columns (0) or rows (1) of the image, and the other way.
+SCANS = {(1, False): Scan.DOWN, (1, True): Scan.UP, (0, False): Scan.RIGHT, (0, True): Scan.LEFT}
+
+
+def make_camera(**changes: object) -> Camera:
+    """The true camera as it is calibrated, whose shutter is not known."""
+    return Camera(TRUE.width, TRUE.height, TRUE.matrix, np.array(TRUE.distortion), **changes)
 
 
 @dataclass(frozen=True)
@@ -48,44 +61,21 @@ class Motion:
         return turned / (2 * h), (p1 - p0) / (2 * h)
 
 
-def distort(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    r2 = x * x + y * y
-    radial = 1.0 + D[0] * r2 + D[1] * r2 * r2
-    u = x * radial + 2.0 * D[2] * x * y + D[3] * (r2 + 2.0 * x * x)
-    v = y * radial + D[2] * (r2 + 2.0 * y * y) + 2.0 * D[3] * x * y
-    return np.stack([K[0, 0] * u + K[0, 2], K[1, 1] * v + K[1, 2]], axis=-1)
-
-
-def project(motion: Motion, t: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Pixels (n,2) of points (n,3), each at its own time (n,); NaN behind the camera."""
-    rotations, centres = motion.pose(t)
-    local = np.einsum("nji,nj->ni", rotations, points - centres)
-    z = np.where(local[:, 2] > 0.1, local[:, 2], np.nan)
-    x, y = local[:, 0] / z, local[:, 1] / z
-    wide = np.hypot(x, y) > 1.1  # beyond this the polynomial folds
-    return np.where(wide[:, None], np.nan, distort(x, y))
-
-
 def expose(
     motion: Motion, stamp: float, readout: float, points: np.ndarray, axis: int = 1
 ) -> np.ndarray:
     """Pixels (n,2) of points on a rolling shutter whose first row (axis 1) or column (axis 0)
     is exposed at ``stamp``; a negative readout time runs the other way, still from ``stamp`` on.
     """
-    size = (WIDTH, HEIGHT)[axis]
-    low, high = np.zeros(len(points)), np.full(len(points), abs(readout))
-    with np.errstate(invalid="ignore"):
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            place = project(motion, stamp + middle, points)[:, axis] / (size - 1)
-            late = (place if readout >= 0 else 1.0 - place) * abs(readout) > middle
-            low, high = np.where(late, middle, low), np.where(late, high, middle)
-        pixels = project(motion, stamp + 0.5 * (low + high), points)
-        place = pixels[:, axis] / (size - 1)
-        place = place if readout >= 0 else 1.0 - place
-        missed = np.abs(place * abs(readout) - 0.5 * (low + high)) > 1e-7 + 1e-6 * abs(readout)
-        inside = np.all((pixels > 0.0) & (pixels < (WIDTH - 1.0, HEIGHT - 1.0)), axis=1)
-    return np.where((inside & ~missed)[:, None], pixels, np.nan)
+    camera = replace(TRUE, readout_time=abs(readout), scan=SCANS[axis, readout < 0.0])
+
+    def local_at(delay: np.ndarray) -> np.ndarray:
+        rotations, centres = motion.pose(stamp + np.nan_to_num(delay))
+        return np.einsum("nji,nj->ni", rotations, points - centres)
+
+    pixels = camera.project_rolling(local_at, (len(points),))
+    shown = np.all((pixels > 0.0) & (pixels < (TRUE.width - 1.0, TRUE.height - 1.0)), axis=1)
+    return np.where(shown[:, None], pixels, np.nan)
 
 
 def room(rng: np.random.Generator, count: int = 600) -> np.ndarray:
@@ -122,6 +112,8 @@ def record(
         seen = rng.permutation(np.flatnonzero(np.isfinite(pixels[:, 0])))[:count]
         found = pixels[seen] + rng.normal(0.0, noise, (len(seen), 2))
         bad = rng.random(len(seen)) < outliers
-        found[bad] = rng.uniform((0.0, 0.0), (WIDTH - 1.0, HEIGHT - 1.0), (int(bad.sum()), 2))
+        found[bad] = rng.uniform(
+            (0.0, 0.0), (TRUE.width - 1.0, TRUE.height - 1.0), (int(bad.sum()), 2)
+        )
         frames.append(Frame(float(stamp), points[seen], found, ~bad))
     return frames

@@ -10,14 +10,13 @@ import projector
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.core.camera import Camera
 from rs_localizer.io.imu import ImuRecording
 from rs_localizer.tools import verdict
 from rs_localizer.tools.adjust.observe import ImagePoints
 from rs_localizer.tools.camera_calibration import CameraCalibration, calibrate
 from rs_localizer.tools.first_lens import first_lens
 
-CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)
+CAMERA = projector.make_camera()
 
 
 @cache
@@ -127,7 +126,6 @@ def test_the_distortion_model_is_that_of_the_lens(model):
     np.testing.assert_allclose(found.distort(corner)[0], camera.distort(corner)[0], atol=1.0)
 
 
-CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)
 CAMERA_FROM_IMU = Rotation.from_rotvec([0.3, -1.2, 0.7]).as_matrix()
 BIAS, OFFSET = np.array([0.02, -0.01, 0.03]), 0.005
 

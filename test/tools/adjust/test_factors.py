@@ -9,7 +9,8 @@ import numpy as np
 import projector
 import pytest
 from dense import are_derivatives, fitting, normal_of
-from test_fit import READOUT, make_camera
+from projector import make_camera
+from test_fit import READOUT
 
 from rs_localizer.core import so3
 from rs_localizer.tools.adjust.factors import (

@@ -1,12 +1,13 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The estimator against an own projector."""
+"""The estimator against the independent camera."""
 
 from dataclasses import replace
 
 import numpy as np
 import projector
 import pytest
+from projector import TRUE, make_camera
 
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
@@ -15,11 +16,6 @@ from rs_localizer.tools.adjust.spline import Spline, first_spline
 from rs_localizer.tools.adjust.variables import Freedom, SplineKeypoints, start_state
 
 READOUT = 0.03
-
-
-def make_camera(**changes: object) -> Camera:
-    return Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D,
-                  **changes)  # fmt: skip
 
 
 def observe(camera: Camera, frames: list[projector.Frame]) -> SplineKeypoints:
@@ -106,5 +102,5 @@ def test_a_wrong_lens_and_a_bent_board_are_found():
     start = start_state(wrong, seen, guess(rng, motion, believed))
     found = fit(wrong, seen, start, Freedom(lens=True, landmarks=2e-3))
     assert abs(found.state.readout_time - READOUT) < 4.0 * found.readout_time_deviation < 4e-4
-    assert found.camera.K[0, 0] == pytest.approx(projector.FOCAL, rel=3e-3)
+    assert found.camera.K[0, 0] == pytest.approx(TRUE.focal, rel=3e-3)
     assert found.deviation == pytest.approx(0.1, rel=0.1)

@@ -7,7 +7,6 @@ import projector
 import pytest
 
 from rs_localizer.core import so3
-from rs_localizer.core.camera import Camera
 from rs_localizer.core.rig import Rig
 from rs_localizer.core.types import Estimate
 from rs_localizer.localizer import Localizer
@@ -16,8 +15,7 @@ from rs_localizer.tools.smoothing import PosedFrame, Smoothed, smooth
 from rs_localizer.tracking import Tracker
 
 READOUT = 0.03
-CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D,
-                readout_time=READOUT)  # fmt: skip
+CAMERA = projector.make_camera(readout_time=READOUT)
 Frames = list[tuple[float, ImagePoints, Estimate]]
 
 

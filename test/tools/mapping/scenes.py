@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of a room and of markers by the tests' own rolling-shutter camera."""
+"""Recordings of a room and of markers by the projector of the tests."""
 
 from dataclasses import dataclass
 
@@ -18,8 +18,7 @@ SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -
 
 
 def camera(readout: float = READOUT) -> Camera:
-    return Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D,
-                  readout_time=readout)  # fmt: skip
+    return projector.make_camera(readout_time=readout)
 
 
 def hand(rng: np.random.Generator, slow: float = 0.5) -> projector.Motion:
