@@ -19,6 +19,7 @@ from catkin_pkg.changelog import get_changelog_from_path
 from catkin_pkg.package import parse_package
 
 import rs_localizer
+from rs_localizer import data
 from rs_localizer.native import build
 from rs_localizer.process import missing
 
@@ -162,3 +163,14 @@ def test_numba_is_asked_for_where_ubuntu_has_it(distribution, numba):
     chosen = {item.name for item in package.exec_depends if item.evaluated_condition}
     assert ("python3-numba" in chosen) is numba
     assert "python3-numpy" in chosen
+
+
+def test_bundled_recordings_are_attributed_and_small():
+    root = data.path(".")
+    files = [file for file in root.rglob("*") if file.is_file() and file.suffix != ".pyc"]
+    assert sum(file.stat().st_size for file in files) < 6_000_000
+    for folder in (child for child in root.iterdir() if child.is_dir()):
+        if folder.name != "__pycache__":
+            text = (folder / "ATTRIBUTION.md").read_text()
+            licences = ("CC BY 4.0", "CC0", "Apache License, Version 2.0")
+            assert any(licence in text for licence in licences)

@@ -3,6 +3,7 @@
 """The doctor finds the topics of a robot, localizes, and says what is wrong."""
 
 import re
+import time
 from pathlib import Path
 
 import pytest
@@ -73,3 +74,16 @@ def test_a_robot_without_a_matcher(start_node, tmp_path):
     assert "no topic has the type sensor_msgs/msg/CameraInfo" in doctor.log
     assert "no PointCloud2 has fields u v" in doctor.log
     assert doctor.log.splitlines()[-1].startswith(("waiting for camera_info", "no frame has come"))
+
+
+def test_the_matcher_of_the_examples_has_a_scene_that_nothing_is_wrong_with(start_node):
+    node = start_node("-p", "readout_time:=0.03")
+    node.wait_for_log("active with solver")
+    client = start_node(run=MATCHER, PYTHONUNBUFFERED="1")
+    while client.log.count("geometry_msgs.msg.Twist(") <= 100:
+        assert client.process.poll() is None, client.log
+        time.sleep(0.1)
+    assert client.stop() == 0
+    assert "Traceback" not in client.log
+    for notice in ("doubtful", "pixels_outside", "too_few_inliers", "map_scale", "lens:"):
+        assert f" {notice}" not in node.log, node.log
