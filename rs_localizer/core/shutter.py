@@ -28,9 +28,7 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, Array1, Array2
 from rs_localizer.core.blocks import add_block
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.state import (
-    PARAMETERS,
-)
+from rs_localizer.core.state import PARAMETERS
 from rs_localizer.native import entry
 
 Numbers = tuple[Array2, Array1, Array1, Array1, Array1, Array1]

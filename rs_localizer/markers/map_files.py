@@ -122,10 +122,7 @@ def _board(entry: _Entry) -> Board:
             "deviation": entry.value("deviation", _NUMBER, None),
         }
         if kind == _CHARUCO:
-            marker, name = (
-                float(entry.value("marker", _NUMBER)),
-                entry.value("family", str),
-            )
+            marker, name = float(entry.value("marker", _NUMBER)), entry.value("family", str)
             own = entry.value("first_id", int, 0), entry.value("legacy", bool, False)
             entry.finish()
             return Charuco(*counts, square, marker, family(name), *own, **given)
@@ -134,10 +131,7 @@ def _board(entry: _Entry) -> Board:
 
 
 def _pose(entry: _Entry) -> Pose:
-    position, rotation = (
-        entry.value("position", list),
-        entry.value("rotation", list, None),
-    )
+    position, rotation = entry.value("position", list), entry.value("rotation", list, None)
     if rotation is None:
         return Pose(position, rotation_of_quaternion(entry.value("quaternion", list)))
     if "quaternion" in entry:

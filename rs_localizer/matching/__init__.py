@@ -282,10 +282,7 @@ class Matcher:
             self._index = make_index(landmarks.descriptors, binary=binary)
 
     def match(
-        self,
-        keypoints: Keypoints,
-        camera: Camera | None = None,
-        prior: Prior | None = None,
+        self, keypoints: Keypoints, camera: Camera | None = None, prior: Prior | None = None
     ) -> Matches:
         """Match keypoints with the map.
 
@@ -366,11 +363,7 @@ class Matcher:
         return nearest, owners
 
     def _predicted(
-        self,
-        queries: Descriptors,
-        pixels: Array,
-        camera: Camera,
-        prior: Prior,
+        self, queries: Descriptors, pixels: Array, camera: Camera, prior: Prior
     ) -> tuple[Nearest, IntArray]:
         """Find the two nearest of the landmarks predicted near each query, and its rival (q,)."""
         assert self._index is not None

@@ -104,9 +104,7 @@ def read_imu_recording(bag: BagReader, topic: str | None, camera_frame: str) -> 
         raise ValueError(f"{bag.path} has no usable message on {topic}{fault}")
     hung = transform_between(bag, camera_frame, frame)
     return ImuRecording(
-        np.array(stamps, np.int64),
-        np.array(rates),
-        None if hung is None else hung.rotation,
+        np.array(stamps, np.int64), np.array(rates), None if hung is None else hung.rotation
     )
 
 

@@ -108,11 +108,7 @@ class Track:
 
 
 def write_frame(
-    writer: BagWriter,
-    frame: Localized,
-    localizer: FrameLocalizer,
-    recorded_ns: int,
-    tally: Tally,
+    writer: BagWriter, frame: Localized, localizer: FrameLocalizer, recorded_ns: int, tally: Tally
 ) -> None:
     """Write all messages of a frame; count it if its transform cannot be told."""
     for name, message in messages(frame, writer.make).items():

@@ -28,10 +28,7 @@ _EXTRAS = {
     "pyarrow": "table",
     "pycolmap": "mapping",
 }
-_PIP = {
-    "cv2": "opencv-python-headless",
-    "yaml": "PyYAML",
-}
+_PIP = {"cv2": "opencv-python-headless", "yaml": "PyYAML"}
 
 
 def explain(error: ImportError) -> str:

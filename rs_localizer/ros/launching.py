@@ -21,13 +21,7 @@ from rs_localizer.config import NO_NAMES, DetectorConfig, NodeConfig, meant
 from rs_localizer.io.reading import YamlError, load_yaml
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMapError
-from rs_localizer.settings import (
-    NODES,
-    Kind,
-    SettingsError,
-    load_params_file,
-    settings,
-)
+from rs_localizer.settings import NODES, Kind, SettingsError, load_params_file, settings
 
 PACKAGE = "rs_localizer"
 Texts = Mapping[str, str]

@@ -32,10 +32,7 @@ TILES = np.tile(picture(0, (64, 64)), (9, 9))
     ("images", "text"),
     [
         (5 * [np.full(SIZE[::-1], 90, np.uint8)], "the images show 0 features each (median)"),
-        (
-            [picture(k) for k in range(6)],
-            "no two of the 6 keyframes determine a structure",
-        ),
+        ([picture(k) for k in range(6)], "no two of the 6 keyframes determine a structure"),
         (
             [TILES[4 * k : 4 * k + SIZE[1], 11 * k : 11 * k + SIZE[0]] for k in range(16)],
             "texture that does not repeat",

@@ -32,11 +32,7 @@ def simulate(out: Path, *words: str) -> int:
 
 
 @pytest.mark.parametrize(
-    ("topic", "words"),
-    [
-        ("/correspondences", []),
-        ("/image_raw/compressed", ["--images"]),
-    ],
+    ("topic", "words"), [("/correspondences", []), ("/image_raw/compressed", ["--images"])]
 )
 def test_bag_holds_frames_and_their_truth(tmp_path, topic, words):
     more = ("--duration", "0.3", "--readout-time", "0.02")

@@ -204,11 +204,7 @@ _LEAST_OBSERVATIONS = 3
 
 
 def marker_constraints(
-    camera: Camera,
-    seen: MapObservations,
-    start: Start,
-    corners: MapObservations,
-    places: Array,
+    camera: Camera, seen: MapObservations, start: Start, corners: MapObservations, places: Array
 ) -> tuple[MapObservations, Start, Array | None]:
     """Return inputs with corners of markers, in their frame; without, if too few are seen.
 

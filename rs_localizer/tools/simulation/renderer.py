@@ -80,10 +80,7 @@ class Renderer:
     """
 
     def __init__(
-        self,
-        camera: Camera,
-        planes: Sequence[TexturedPlane],
-        settings: ImageSettings | None = None,
+        self, camera: Camera, planes: Sequence[TexturedPlane], settings: ImageSettings | None = None
     ) -> None:
         self.camera = camera
         self.planes = tuple(planes)
@@ -170,10 +167,7 @@ class RenderedFrame:
 
 
 def rendered_frames(
-    renderer: Renderer,
-    motion: TrueMotion,
-    stamps_ns: Sequence[int],
-    seed: int = 0,
+    renderer: Renderer, motion: TrueMotion, stamps_ns: Sequence[int], seed: int = 0
 ) -> Iterator[RenderedFrame]:
     """Yield frames along a motion, whose first rows are exposed at ``stamps_ns``.
 

@@ -9,12 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer import data
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.tools.simulation.simulated_imu import (
-    ImuSettings,
-    Lever,
-    Shaken,
-    simulate_imu,
-)
+from rs_localizer.tools.simulation.simulated_imu import ImuSettings, Lever, Shaken, simulate_imu
 from rs_localizer.tools.simulation.true_motion import RecordedMotion
 
 PERFECT = ImuSettings(2000.0, 0.0, 0.0, 0.0, 0.0, 0.0)
