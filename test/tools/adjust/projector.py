@@ -14,12 +14,7 @@ from benchmarks.independent.cameras import Camera as TrueCamera
 from benchmarks.independent.cameras import Scan
 from rs_localizer.core.camera import Camera
 
-
-class Lens(TrueCamera):
-    centre = np.array([321.3, 236.8])
-
-
-TRUE = Lens(distortion=(-0.12, 0.04, 0.001, -0.0015, 0.0))
+TRUE = TrueCamera(distortion=(-0.12, 0.04, 0.001, -0.0015, 0.0))
 # Along columns (0) or rows (1) of the image, and the other way.
 SCANS = {(1, False): Scan.DOWN, (1, True): Scan.UP, (0, False): Scan.RIGHT, (0, True): Scan.LEFT}
 
@@ -47,7 +42,7 @@ class Motion:
             scale * rng.uniform(0.5, 1.0, shape), frequencies, rng.uniform(0.0, 6.28, shape)
         )
 
-    def pose(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def poses(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """map_from_camera rotations (n,3,3) and camera centres (n,3) at times (n,)."""
         t = np.asarray(t, float)[:, None, None]
         x = np.sum(self.amplitudes * np.sin(self.frequencies * t + self.phases), axis=2)
@@ -56,7 +51,7 @@ class Motion:
     def twist(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Body rate (n,3) and velocity in the map (n,3), by differences."""
         h = 1e-5
-        (r0, p0), (r1, p1) = self.pose(t - h), self.pose(t + h)
+        (r0, p0), (r1, p1) = self.poses(t - h), self.poses(t + h)
         turned = Rotation.from_matrix(np.swapaxes(r0, 1, 2) @ r1).as_rotvec()
         return turned / (2 * h), (p1 - p0) / (2 * h)
 
@@ -70,7 +65,7 @@ def expose(
     camera = replace(TRUE, readout_time=abs(readout), scan=SCANS[axis, readout < 0.0])
 
     def local_at(delay: np.ndarray) -> np.ndarray:
-        rotations, centres = motion.pose(stamp + np.nan_to_num(delay))
+        rotations, centres = motion.poses(stamp + np.nan_to_num(delay))
         return np.einsum("nji,nj->ni", rotations, points - centres)
 
     pixels = camera.project_rolling(local_at, (len(points),))

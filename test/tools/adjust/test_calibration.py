@@ -165,4 +165,4 @@ def test_offset_rotation_and_bias_are_found():
     truth = shape[[0, 1, 2, 1, 0, 0], [0, 1, 2, 2, 2, 1]]
     assert np.all(np.abs(mount.mount.shape - truth) < 5.0 * mount.shape_deviations)
     assert mount.noise == pytest.approx(0.01, rel=0.2)
-    assert abs(found.readout_time - readout) < 4.0 * found.deviation < 2e-4
+    assert abs(found.readout_time - readout) < 4.0 * found.deviation < 2.5e-4

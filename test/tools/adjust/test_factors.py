@@ -112,7 +112,7 @@ def small(
                          distortion_model=distortion)  # fmt: skip
     motion, landmarks = projector.Motion.random(rng), projector.room(rng, 8)
     layout = Layout.over(np.array([[0.0, controls]]), 0.04)
-    spline = Spline(layout, *motion.pose(layout.control_times()))
+    spline = Spline(layout, *motion.poses(layout.control_times()))
     count = 60
     pixels, frames = rng.uniform(0.0, 400.0, (count, 2)), np.sort(rng.integers(0, 5, count))
     seen = SplineKeypoints(

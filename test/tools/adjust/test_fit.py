@@ -40,7 +40,7 @@ def guess(
 ) -> Spline:  # fmt: skip
     """A spline through poses that are some mm and tenths of a degree off."""
     times = np.array([frame.stamp for frame in frames])
-    rotations, positions = motion.pose(times + 0.5 * READOUT)
+    rotations, positions = motion.poses(times + 0.5 * READOUT)
     rotations = rotations @ so3.exp_many(rng.normal(0.0, 0.003, (len(times), 3)))
     positions = positions + rng.normal(0.0, 0.01, positions.shape)
     return first_spline(times, rotations, positions, spacing, 0.03)
@@ -57,7 +57,7 @@ def test_truth_without_noise():
     assert found.state.readout_time == pytest.approx(READOUT, abs=2e-6)
     assert np.sqrt(found.squared_errors.max()) < 0.02
     times = np.linspace(0.2, 1.8, 20)
-    rotations, positions = motion.pose(times + 0.5 * READOUT)
+    rotations, positions = motion.poses(times + 0.5 * READOUT)
     states = found.state.spline.states(times)
     np.testing.assert_allclose(states.positions, positions, atol=2e-4)
     np.testing.assert_allclose(states.rotations, rotations, atol=2e-4)
@@ -77,7 +77,7 @@ def test_noise_outliers_and_columns_that_are_read_backwards():
     assert found.deviation == pytest.approx(0.3, rel=0.06)
     assert np.mean(found.inliers == seen.trusted) > 0.99
     times = np.linspace(0.2, 1.8, 40)
-    _, positions = motion.pose(times + 0.5 * abs(readout))
+    _, positions = motion.poses(times + 0.5 * abs(readout))
     angular, linear = motion.twist(times + 0.5 * abs(readout))
     states, covariances = found.state.spline.states(times), found.state_covariances(times)
     for errors, at in (

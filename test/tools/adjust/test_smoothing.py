@@ -36,7 +36,7 @@ def errors(
     motion: projector.Motion, times: np.ndarray, estimates: list[Estimate]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Errors (m,12) in the order of the covariance, SI, and the covariances (m,12,12)."""
-    rotations, positions = motion.pose(times)
+    rotations, positions = motion.poses(times)
     angular, linear = motion.twist(times)
     scale = np.repeat([1.0, 1.0 / READOUT], 6)
     rows = [

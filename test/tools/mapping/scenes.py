@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings of a room and of markers by the projector of the tests."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import projector
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.core import so3
+from benchmarks.mapping import Film
 from rs_localizer.core.camera import Camera
 from rs_localizer.tools.mapping.map_keypoints import MapObservations, Start
 from rs_localizer.tools.mapping.unknown_markers import Spotted
@@ -39,30 +39,17 @@ class Walk:
     points: np.ndarray  # (p,3)
 
 
+def film(motion: projector.Motion, stamps: np.ndarray, readout: float = READOUT) -> Film:
+    return Film(replace(projector.TRUE, readout_time=readout), motion, stamps)
+
+
 def walk(
     rng: np.random.Generator, stamps: np.ndarray, *, points: int = 150, count: int = 60,
-    noise: float = 0.3, off: float = 0.02, readout: float = READOUT,
+    readout: float = READOUT,
 ) -> Walk:  # fmt: skip
-    """A map that is ``off`` (m), seen at stamps (g,), s."""
-    motion, room = hand(rng), projector.room(rng, points)
-    images, landmarks, pixels = [], [], []
-    for g, stamp in enumerate(stamps):
-        exposed = projector.expose(motion, float(stamp), readout, room)
-        shown = rng.permutation(np.flatnonzero(np.isfinite(exposed[:, 0])))[:count]
-        images.append(np.full(len(shown), g))
-        landmarks.append(shown)
-        pixels.append(exposed[shown] + rng.normal(0.0, noise, (len(shown), 2)))
-    rotations, positions = motion.pose(stamps + 0.5 * readout)
-    start = Start(
-        room + rng.normal(0.0, off, room.shape),
-        rotations @ so3.exp_many(rng.normal(0.0, 0.2 * off, (len(stamps), 3))),
-        positions + rng.normal(0.0, off, positions.shape),
-    )
-    stamps_ns = 10**12 + np.round(1e9 * stamps).astype(np.int64)
-    seen = MapObservations(
-        stamps_ns, np.concatenate(images), np.concatenate(landmarks), np.concatenate(pixels)
-    )
-    return Walk(seen, start, room)
+    """A map that is 2 cm off, seen at stamps (g,), s."""
+    shown, room = film(hand(rng), stamps, readout), projector.room(rng, points)
+    return Walk(shown.see(room, rng, count), shown.near(room, rng), room)
 
 
 def ring(rng: np.random.Generator, count: int, size: float) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -80,15 +67,7 @@ def ring(rng: np.random.Generator, count: int, size: float) -> list[tuple[np.nda
 
 def spot(
     rng: np.random.Generator, poses: list[tuple[np.ndarray, np.ndarray]], size: float,
-    stamps: np.ndarray, noise: float = 0.1,
+    stamps: np.ndarray,
 ) -> list[Spotted]:  # fmt: skip
     """The markers that images at stamps (g,), s, of their first rows show as a whole."""
-    motion = hand(rng, 0.25)
-    corners = np.concatenate([size * SQUARE @ turn.T + place for turn, place in poses])
-    spotted = []
-    for stamp in stamps:
-        quads = projector.expose(motion, float(stamp), READOUT, corners).reshape(-1, 4, 2)
-        whole = np.flatnonzero(np.isfinite(quads).all(axis=(1, 2)))
-        found = quads[whole] + rng.normal(0.0, noise, (len(whole), 4, 2))
-        spotted.append(Spotted(10**12 + round(1e9 * float(stamp)), whole, found))
-    return spotted
+    return film(hand(rng, 0.25), stamps, READOUT).spot(poses, size, rng)

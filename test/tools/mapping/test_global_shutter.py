@@ -107,7 +107,7 @@ def test_the_model_is_that_of_a_global_shutter(scene, model, shutter, tmp_path, 
     assert (points.colors == 90).all()
     # The keypoints are where a global shutter would have seen the points at the middle row's time.
     motion = hand(np.random.default_rng(3))
-    rotations, positions = motion.pose(VIDEO + 0.5 * READOUT)
+    rotations, positions = motion.poses(VIDEO + 0.5 * READOUT)
     errors = []
     for name, image in read_model(out).images.items():
         k = int(name[6:10])
