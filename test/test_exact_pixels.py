@@ -4,6 +4,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from benchmarks.independent.cameras import Camera
@@ -13,21 +14,11 @@ from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_st
 from rs_localizer.tools.simulation.walls import three_walls
 from rs_localizer.tracking import Tracker
 
-from .moving import camera_of
+from .moving import camera_of, shown
 
 TRUE = Camera(focal=500.0, distortion=(0.0,) * 5)
 SIZE = np.array([TRUE.width, TRUE.height])
 LOCALIZER = rsl.Localizer(camera_of(TRUE))
-
-
-def seen(hand, stamp_ns, points):
-    """Pixels (n,2) of points (n,3) that the hand sees, each in its own row."""
-
-    def local_at(delay):
-        state = hand.state(stamp_ns, np.nan_to_num(delay))
-        return np.einsum("nji,nj->ni", state.rotations, points - state.positions)
-
-    return TRUE.project_rolling(local_at, (len(points),))
 
 
 @pytest.fixture(scope="module")
@@ -38,14 +29,19 @@ def frames():
     first = hand.intervals_ns[0][0] + 500_000_000
     found = []
     for stamp_ns in first + np.arange(0, 4_000_000_000, 33_333_333):
-        pixels = seen(hand, int(stamp_ns), corners)
+        middle_ns = int(stamp_ns) + round(0.5e9 * TRUE.readout_time)
+
+        def pose(after, middle_ns=middle_ns):
+            state = hand.state(middle_ns, np.nan_to_num(after))
+            return Rotation.from_matrix(state.rotations), state.positions
+
+        pixels = shown(TRUE, pose, corners)
         quads = pixels.reshape(-1, 4, 2)
         sides = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2).min(axis=1)
         inside = np.all((quads > 2.0) & (quads < SIZE - 3.0), axis=(1, 2)) & (sides > 16.0)
-        shown = np.repeat(inside, 4)
-        if np.count_nonzero(shown) >= 12:
-            middle_ns = int(stamp_ns) + round(0.5e9 * TRUE.readout_time)
-            single = (array[shown].astype(np.float32) for array in (corners, pixels))
+        whole = np.repeat(inside, 4)
+        if np.count_nonzero(whole) >= 12:
+            single = (array[whole].astype(np.float32) for array in (corners, pixels))
             turned = hand.state(middle_ns, np.zeros(1)).rotations[0]
             found.append((middle_ns, *single, turned))
     assert len(found) > 80

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames refused for how their sender counts pixels or corners: what would fit is named.
 
-Pixels are projected by the tests' own means, each at the time of its row.
+Pixels are the independent projector's, each at the time of its row.
 """
 
 import cv2
@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.independent.cameras import Camera as TrueCamera
 from rs_localizer.config import DetectorConfig, NodeConfig
-from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.images import Image
@@ -23,11 +23,11 @@ from rs_localizer.pipeline.marker_detector import FrameDetector
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.pipeline.what_fits import Mistakes, what_fits
 
+from ..moving import camera_of, shown  # noqa: TID252 - Python has a package "test"
 from .clouds import cloud_of
 
-K = np.array([[500.0, 0.0, 319.5], [0.0, 510.0, 239.5], [0.0, 0.0, 1.0]])
-READOUT = 0.03
-CAMERA = Camera(640, 480, K, readout_time=READOUT)
+TRUE = TrueCamera(focal=500.0, distortion=(0.0,) * 5)
+K, READOUT, CAMERA = TRUE.matrix, TRUE.readout_time, camera_of(TRUE)
 RATE, VELOCITY = np.array([0.4, -0.6, 0.5]), np.array([0.3, 0.1, -0.2])
 
 
@@ -45,12 +45,12 @@ def corners():
 
 def seen(points, t, noise=0.3):
     """Pixels (n,2) of points at the stamp t of the middle row."""
-    pixels = np.tile(K[:2, 2], (len(points), 1))
-    for _ in range(10):
-        tau = t + READOUT * (np.clip(pixels[:, 1], 0, 479) / 479.0 - 0.5)
-        turned = Rotation.from_rotvec(tau[:, None] * RATE).inv()
-        local = turned.apply(points - tau[:, None] * VELOCITY)
-        pixels = local[:, :2] / local[:, 2:] * [500.0, 510.0] + K[:2, 2]
+
+    def pose(after):
+        time = (t + after)[:, None]
+        return Rotation.from_rotvec(time * RATE), time * VELOCITY
+
+    pixels = shown(TRUE, pose, points)
     return pixels + noise * np.random.default_rng(round(1e3 * t)).normal(size=pixels.shape)
 
 
@@ -76,7 +76,7 @@ MIRROR = MISTAKES["mirrored, left to right or top to bottom"]
 def test_each_mistake_is_named_and_no_other(name):
     points, ids = corners(), np.arange(40)
     pixels = MISTAKES[name](seen(points, 0.2))
-    for camera in (CAMERA, Camera(640, 480, K)):
+    for camera in (CAMERA, camera_of(TRUE, readout_time=0.0)):
         localizer = Localizer(camera)
         assert not localizer.localize(points, pixels)
         said = what_fits(localizer, points, pixels, ids)
