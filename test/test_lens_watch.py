@@ -4,18 +4,21 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from benchmarks.frames.gross import frame
+from benchmarks.independent.cameras import Camera as TrueCamera
 from benchmarks.kinds import judged, kinds
 from rs_localizer.config import CalibrationErrors, LocalizerConfig
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.types import Failure
 from rs_localizer.lens_watch import LensWatch
 from rs_localizer.tracking import Tracker
+
+from .moving import camera_of
 
 WELL = CalibrationErrors(0.1, 4e-4, 0.05, 4e-4)
 
@@ -87,47 +90,25 @@ def test_what_motion_hides_within_a_frame_frames_together_tell(name, published, 
     assert any(said in text for text in texts) if said else not texts
 
 
+TRUE = TrueCamera(1280, 720, focal=900.0, distortion=(0.0,) * 5, readout_time=0.02)
+
+
 def moving_board(board: np.ndarray, moved: np.ndarray, seconds: float) -> np.ndarray:
-    """Pixels of a camera of f = 900 px that reads 720 rows in 20 ms.
-
-    ``moved``: place (3,), angles (3,), and both per second.
-    """
+    """Pixels of a board that moves: place (3,), angles (3,), and both per second."""
     place, angles, velocity, rates = moved.reshape(4, 3)
-    times, pixels = np.full(len(board), seconds), np.zeros((len(board), 2))
-    for _ in range(5):
-        for k, time in enumerate(times):
-            turn = cv2.Rodrigues(angles + rates * time)[0]
-            x, y, depth = turn @ board[k] + place + velocity * time
-            pixels[k] = 900.0 * x / depth + 639.5, 900.0 * y / depth + 359.5
-        times = seconds + 0.02 * (pixels[:, 1] / 719.0 - 0.5)
-    return pixels
 
+    def local_at(delay: np.ndarray) -> np.ndarray:
+        time = (seconds - 0.01 + delay)[:, None]
+        return Rotation.from_rotvec(angles + rates * time).apply(board) + place + velocity * time
 
-def test_a_ceiling_that_is_seen_squarely_leaves_poses_as_sure_as_they_are():
-    """It hardly tells a focal length, which must not walk away from a right one, by its noise."""
-    random = np.random.default_rng(2)
-    camera = rsl.Camera(1280, 720, [[900, 0, 639.5], [0, 900, 359.5], [0, 0, 1]], readout_time=0.02)
-    board = np.column_stack([random.uniform(-2.5, 2.5, (60, 2)) * [1.0, 0.6], np.zeros(60)])
-    amplitudes = np.array([0.3, 0.2, 0.05, 0.003, 0.003, 0.2])
-    phases, claimed = random.uniform(0.0, 6.0, 6), []
-    tracker = Tracker(rsl.Localizer(camera))
-    for k in range(80):
-        moved = np.zeros((2, 6))
-        moved[0] = amplitudes * np.sin(2.0 * k / 30.0 + phases)
-        moved[1] = 2.0 * amplitudes * np.cos(2.0 * k / 30.0 + phases)
-        moved[0, 2] += 4.5
-        places = np.array([moved[0, :3], moved[0, 3:], moved[1, :3], moved[1, 3:]]).ravel()
-        pixels = moving_board(board, places, 0.0) + 0.5 * random.normal(size=(60, 2))
-        found = tracker.localize(k * 33_333_333, board, pixels)
-        claimed.append(np.sqrt(np.trace(found.covariance[3:6, 3:6])) if found else np.inf)
-    assert max(claimed[8:]) < 0.03  # m
+    return TRUE.project_rolling(local_at, (len(board),))
 
 
 @pytest.mark.parametrize("lost", [False, True])
 def test_a_recording_with_gaps_shows_no_other_matrix(lost):
     """Stamps run on while the camera is elsewhere, or an image is lost: no parabola fits."""
     random = np.random.default_rng(1)
-    camera = rsl.Camera(1280, 720, [[900, 0, 639.5], [0, 900, 359.5], [0, 0, 1]], readout_time=0.02)
+    camera = camera_of(TRUE)
     across, along = np.meshgrid(0.05 * np.arange(-3.5, 4.0), 0.05 * np.arange(-2.5, 3.0))
     board = np.column_stack([across.ravel(), along.ravel(), np.zeros(across.size)])
     usual, gaps = np.repeat([0.12, 0.2, 0.2, 0.3], 3), (2, 5)
@@ -146,7 +127,7 @@ def test_a_recording_with_gaps_shows_no_other_matrix(lost):
 def test_poses_allow_for_a_focal_length_that_frames_doubt():
     """A board of 0.5 m that the camera faces is as much farther away as its focal length is."""
     random = np.random.default_rng(1)
-    camera = rsl.Camera(1280, 720, [[900, 0, 639.5], [0, 900, 359.5], [0, 0, 1]], readout_time=0.02)
+    camera = camera_of(TRUE)
     x, y = np.meshgrid(np.linspace(-0.25, 0.25, 9), np.linspace(-0.15, 0.15, 6))
     board = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     moved = np.r_[0.0, 0.0, 2.0, np.zeros(3), 0.3, 0.0, 0.0, 0.0, 0.4, 0.0]
