@@ -4,28 +4,25 @@
 
 import numpy as np
 import pytest
+from recorded import CAMERA, READOUT_TIME, flight
 
 from rs_localizer.config import NodeConfig
-from rs_localizer.core.camera import Camera
-from rs_localizer.io.bags import BagWriter, make_message, open_bag
-from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.offline.replay import prepare_replay, replay
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.simulated_frames import simulate_frames
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings
-from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
-K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
-CAMERA = Camera(640, 480, K, readout_time=0.03)
+from ..pipeline.clouds import cloud_of  # noqa: TID252 - Python has a package "test"
+
 YEARS = 17 * 10**17
-MOTION = ConstantVelocity(np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.3)
+CONFIG = NodeConfig(readout_time=READOUT_TIME)
 
 
 @pytest.fixture(scope="module")
 def frames():
     world = room(np.zeros((1, 3)), np.random.default_rng(0), count=3000)
-    return list(simulate_frames(CAMERA, MOTION, world, FrameSettings(80, 0.5, 0.0)))
+    return flight(world, 9, FrameSettings(80, 0.5, 0.0), 0)
 
 
 def answers(path, frames, start_ns, unset=()):
@@ -33,14 +30,11 @@ def answers(path, frames, start_ns, unset=()):
     with BagWriter(path) as bag:
         for k, frame in enumerate(frames):
             then = start_ns + frame.stamp_ns
-            rows = np.empty(len(frame.points), [(name, "<f8") for name in "xyzuv"])
-            for name, column in zip("xyzuv", [*frame.points.T, *frame.pixels.T], strict=True):
-                rows[name] = column
-            cloud = make_cloud(make_message, 0 if k in unset else then, "map", rows)
+            cloud = cloud_of(0 if k in unset else then, frame.points, frame.pixels)
             bag.write("/camera_info", make_camera_info(CAMERA, then), then)
             bag.write("/correspondences", cloud, then)
     with open_bag(path) as bag:
-        return [a.result for a in replay(bag, *prepare_replay(bag, NodeConfig(readout_time=0.03)))]
+        return [a.result for a in replay(bag, *prepare_replay(bag, CONFIG))]
 
 
 def test_a_recording_that_starts_at_zero_has_its_first_frame(tmp_path, frames):
