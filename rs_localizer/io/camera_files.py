@@ -23,6 +23,7 @@ from rs_localizer.io.camera_info import interpret_lens
 from rs_localizer.io.reading import (
     LENS,
     YamlError,
+    dump_yaml,
     file_faults,
     load_yaml,
     parameter_blocks,
@@ -332,18 +333,19 @@ def lens_parameters(camera: Camera) -> dict[str, Any]:
 
 def write_calibration(path: Path, camera: Camera) -> None:
     """Write a camera's lens as ROS' camera_calibration and camera_info_manager do."""
-    projection = np.hstack([camera.K, np.zeros((3, 1))])
-    matrices = (
-        ("camera_matrix", camera.K),
-        ("distortion_coefficients", camera.D[None]),
-        ("rectification_matrix", np.eye(3)),
-        ("projection_matrix", projection),
-    )
-    text = f"image_width: {camera.width}\nimage_height: {camera.height}\ncamera_name: camera\n"
-    for name, matrix in matrices:
-        values = ", ".join(repr(float(value)) for value in matrix.ravel())
-        rows, columns = matrix.shape
-        text += f"{name}:\n  rows: {rows}\n  cols: {columns}\n  data: [{values}]\n"
-        if name == "camera_matrix":
-            text += f"distortion_model: {camera.distortion_model}\n"
-    path.write_text(text, encoding="utf-8")
+    tree = {
+        "image_width": camera.width,
+        "image_height": camera.height,
+        "camera_name": "camera",
+        "camera_matrix": _matrix(camera.K),
+        "distortion_model": str(camera.distortion_model),
+        "distortion_coefficients": _matrix(camera.D[None]),
+        "rectification_matrix": _matrix(np.eye(3)),
+        "projection_matrix": _matrix(np.hstack([camera.K, np.zeros((3, 1))])),
+    }
+    path.write_text(dump_yaml(tree), encoding="utf-8")
+
+
+def _matrix(values: Array) -> dict[str, Any]:
+    rows, columns = values.shape
+    return {"rows": rows, "cols": columns, "data": values.ravel().tolist()}

@@ -107,6 +107,11 @@ def load_yaml(text: str) -> Any:
         raise YamlError(" ".join(str(error).split())) from error
 
 
+def dump_yaml(tree: dict[str, Any]) -> str:
+    """Return the text of mappings, with lists of numbers in lines."""
+    return str(yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=100))
+
+
 def parameter_blocks(tree: Any, node: str = "", path: str = "") -> Iterator[tuple[str, Any]]:
     """Name of a node, given as a path or nested, and its ``ros__parameters``; ``""``: of any."""
     for key, value in tree.items() if isinstance(tree, dict) else ():

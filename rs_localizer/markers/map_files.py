@@ -20,9 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from rs_localizer.io.reading import file_faults, load_yaml, read_text
+from rs_localizer.io.reading import dump_yaml, file_faults, load_yaml, read_text
 from rs_localizer.markers.families import FAMILIES, Family, family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.markers.poses import Pose, finite, quaternion_of_rotation, rotation_of_quaternion
@@ -201,7 +200,7 @@ def write_marker_map(path: Path | str, marker_map: MarkerMap) -> None:
         tree["markers"] = [_marker_entry(marker) for marker in marker_map.markers]
     if marker_map.boards:
         tree["boards"] = [_board_entry(board) for board in marker_map.boards]
-    Path(path).write_text(_EXPLANATION + _yaml(tree, 100), encoding="utf-8")
+    Path(path).write_text(_EXPLANATION + dump_yaml(tree), encoding="utf-8")
 
 
 def _marker_entry(marker: Marker) -> dict[str, Any]:
@@ -243,10 +242,6 @@ def _pose_entry(pose: Pose) -> dict[str, Any]:
 def _rounded(values: Iterable[float]) -> list[float]:
     """Round the errors of a fitted pose away: 0.16 instead of 0.16000000000000003."""
     return [round(float(value), 12) + 0.0 for value in values]
-
-
-def _yaml(tree: dict[str, Any], width: int) -> str:
-    return str(yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=width))
 
 
 _NUMBER = (int, float)

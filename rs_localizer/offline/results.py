@@ -34,6 +34,7 @@ from rs_localizer.io.trajectories import (
     Motions,
     Trajectory,
     Twists,
+    format_stamp,
     write_tum,
     write_twists,
 )
@@ -247,7 +248,7 @@ def write_results(
                     smoothed.add(frame.input_stamp_ns)
     if tally.smoothed is not None:
         stamps = tally.smoothed.bridged.tolist()
-        text = "".join(f"{stamp // 10**9}.{stamp % 10**9:09}\n" for stamp in stamps)
+        text = "".join(f"{format_stamp(stamp)}\n" for stamp in stamps)
         (out / BRIDGED).write_text(text, encoding="utf-8")
     if tally.table is not None:
         for answer in refused:

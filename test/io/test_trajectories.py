@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.io.bags import BagError, BagWriter
+from rs_localizer.io.messages import make_header, make_vector
 from rs_localizer.io.trajectories import (
     Trajectory,
     TrajectoryError,
@@ -92,19 +93,15 @@ def test_split_only_at_gaps():
 def stamped(kind: str, seconds: int, first: list[float], second: list[float]):
     """PoseStamped or TwistStamped of position and quaternion, or of rates and velocity."""
     make = BagWriter.make
-    stamp = make("builtin_interfaces/msg/Time", sec=seconds, nanosec=0)
-    header = make("std_msgs/msg/Header", stamp=stamp, frame_id="map")
     if kind == "TwistStamped":
-        parts = [
-            make("geometry_msgs/msg/Vector3", **dict(zip("xyz", values, strict=True)))
-            for values in (first, second)
-        ]
-        twist = make("geometry_msgs/msg/Twist", angular=parts[0], linear=parts[1])
-        return make("geometry_msgs/msg/TwistStamped", header=header, twist=twist)
-    point = make("geometry_msgs/msg/Point", **dict(zip("xyz", first, strict=True)))
-    turn = make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", second, strict=True)))
-    pose = make("geometry_msgs/msg/Pose", position=point, orientation=turn)
-    return make("geometry_msgs/msg/PoseStamped", header=header, pose=pose)
+        angular, linear = (make_vector(make, np.array(each, float)) for each in (first, second))
+        parts = {"twist": make("geometry_msgs/msg/Twist", angular=angular, linear=linear)}
+    else:
+        point = make_vector(make, np.array(first, float), "Point")
+        turn = make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", second, strict=True)))
+        parts = {"pose": make("geometry_msgs/msg/Pose", position=point, orientation=turn)}
+    header = make_header(make, seconds * 10**9, "map")
+    return make(f"geometry_msgs/msg/{kind}", header=header, **parts)
 
 
 def test_poses_and_twists_of_a_recording(tmp_path):

@@ -161,7 +161,7 @@ def three_walls(path: TrueState) -> Scene:
     The corner stands where the camera looks on average.
 
     Args:
-        way: of the camera, evenly in time, in a map whose z points up.
+        path: of the camera, evenly in time, in a map whose z points up.
     """
     box = _box(path, turned=0.25 * np.pi)
     corner = np.array([*(box.high[:2] + _NEAR), box.low[2] - _BELOW])

@@ -14,6 +14,7 @@ from sensor_msgs.msg import Image, PointCloud2
 from rs_localizer.cli.commands import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
+from rs_localizer.io.messages import make_header
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.ros.node.conversion import copy_message
 
@@ -28,9 +29,8 @@ def image(second: int, **changes: Any) -> Any:
     """Spots; a picture of its own for every second."""
     noise = np.random.default_rng(second).integers(0, 256, (240, 320), np.uint8)
     pixels = cv2.GaussianBlur(noise, (0, 0), 2.0)
-    stamp = make_message("builtin_interfaces/msg/Time", sec=second, nanosec=0)
     values = {
-        "header": make_message("std_msgs/msg/Header", stamp=stamp, frame_id="eye"),
+        "header": make_header(make_message, second * 10**9, "eye"),
         "height": 240, "width": 320, "encoding": "mono8", "is_bigendian": 0, "step": 320,
         "data": pixels.ravel(),
     }  # fmt: skip
