@@ -72,7 +72,6 @@ SWITCHES: dict[str, tuple[Switch, ...]] = {
     ),
     "undetermined": (Switch(_REFUSAL, _with_posterior(smallest_eigenvalue=1.0)),),
     "uncertain": (Switch("rs_localizer.localizer:uncertain", _always(None)),),
-    "smooth-too-large": (Switch(_REFUSAL, _with_posterior(model_error=0.0)),),
     "own-motion": (Switch("rs_localizer.estimation.left_out:_own_motion", _always(None)),),
     "another-matrix": (
         Switch("rs_localizer.estimation.left_out:_of_another_lens", _always(None)),

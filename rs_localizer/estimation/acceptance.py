@@ -36,20 +36,12 @@ from rs_localizer.estimation.points import Observed, Usable
 # Errors as large as the gate lets them be are those of points strewn over it.
 # A global shutter leaves errors of the motion beside the noise. In inlier thresholds.
 _MOST_NOISE, _MOST_NOISE_GLOBAL_SHUTTER = 0.75, 1.0
-# Smooth errors may be so many times what is declared: of printed boards, nine (benchmarks.real).
-_MOST_DECLARED = math.exp(3.5)
 # Largest standard deviation of the orientation, rad: 4 degrees are 7 cm at a metre.
 MOST_TURN = 0.07
 # An orientation that is open because the camera may move is accepted up to so many times the limit:
 # hand-held boards of 12 to 20 cm come to 1.5 times (benchmarks.real), and beyond three a covariance
 # no longer says where a pose on an arc may be.
 _OPEN = 3.0
-# Errors of map and lens (root mean square, inlier thresholds) beyond which no region is believed.
-_MOST_MODEL_ERROR = 1.5
-# A wrong lens before a wall is fitted by velocities that nobody expects, and leaves smooth errors:
-# of this limit so many squared deviations of the velocities leave a part of 1 / e. Cameras that are
-# fast leave none (a phone at 3.4 deviations: 0.04 px).
-_SPEEDS_AND_ERRORS, _LEAST_OF_THE_LIMIT = 8.0, 0.25
 # Points that lie closer together than this (px) show no perspective.
 _LEAST_EXTENT = 5.0
 
@@ -86,7 +78,6 @@ def refusal(
     """Return the reason to refuse an estimate, or None.
 
     Args:
-        posterior: ``declared`` is all that map and calibration are known to be off.
         samples: minimal samples drawn, for the message.
         min_inliers, threshold: of the configuration.
         rolling: whether velocities were estimated.
@@ -111,15 +102,6 @@ def refusal(
             f"{found} inliers with errors of {posterior.noise:.2g} px (one sigma) around an "
             f"inlier_threshold of {threshold:g} px: no motion fits them, or the threshold is "
             "too small for the noise; set map_deviation, if points of the map are that far off",
-        )
-    doubt = max(math.exp(-posterior.speeding / _SPEEDS_AND_ERRORS), _LEAST_OF_THE_LIMIT)
-    if rolling and posterior.model_error > math.hypot(
-        doubt * _MOST_MODEL_ERROR * threshold, _MOST_DECLARED * posterior.declared
-    ):
-        return Failure(
-            Reason.MODEL_ERROR,
-            f"errors of {posterior.model_error:.2g} px are smooth over the image: the calibration "
-            "or the map is too far off for any pose",
         )
     return None
 

@@ -119,7 +119,10 @@ def what_fits(
             continue
         usable = np.isfinite(changed).all(axis=1)
         found = localizer.localize(points[usable], changed[usable])
-        if found and (count := int(np.count_nonzero(found.inliers))) >= _MOST * len(points):
+        # Before a wrong lens anything fits, with smooth errors beyond the gate.
+        if not found or found.model_error > localizer.config.inlier_threshold:
+            continue
+        if (count := int(np.count_nonzero(found.inliers))) >= _MOST * len(points):
             fits[count, -found.residual_rms] = mistake
     return f"the points fit if {fits[max(fits)]}" if fits else ""
 

@@ -42,8 +42,6 @@ def reason(posterior):
         # Errors as large as the gate.
         ({"noise": 1.45}, None),
         ({"noise": 1.55}, Reason.RESIDUAL),
-        ({"model_error": 2.9}, None),
-        ({"model_error": 3.1}, Reason.MODEL_ERROR),
     ],
 )
 def test_what_is_wrong_with_a_posterior_is_its_reason(good, changes, expected):

@@ -98,7 +98,7 @@ LENS, NOISE = named("camera/lens 30%/wall/1px"), named("noise/0.3deg/40points/1p
 SEEN_IN = {
     "smooth-error": LENS, "in-frame-turn": SHAKEN, "calibration-effect": SHAKEN,
     "typical-speeds": PLANE, "grid-over-leans": PLANE, "mixture-of-steady-and-vibrating": SHAKEN,
-    "too-few": GARBAGE, "undetermined": None, "uncertain": PLANE, "smooth-too-large": LENS,
+    "too-few": GARBAGE, "undetermined": None, "uncertain": PLANE,
     "own-motion": HALVES, "left-out": HALVES,
     "another-matrix": FOCAL, "by-chance": ROUGH, "window": SHAKEN,
     "learnt-accelerations": SHAKEN,
