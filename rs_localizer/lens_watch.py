@@ -23,6 +23,7 @@ from rs_localizer.core.rig import Exposure
 from rs_localizer.core.scanning import VERTICAL
 from rs_localizer.core.state import ANGULAR, LINEAR
 from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.estimation.calibration import ErrorModes, LandmarkErrors
 from rs_localizer.estimation.frames_together import FRAMES, Fitted, FramesTogether, Matrix
 
 # Frames of which the median counts.
@@ -77,7 +78,10 @@ class LensWatch:
     @property
     def fault(self) -> str:
         """How the last frames contradict what is declared, in one sentence."""
-        return self._smooth if self.matrix is None else str(self.matrix)
+        if self.matrix is not None:
+            return str(self.matrix)
+        stretch = None if self._together is None else self._together.stretch
+        return str(stretch) if stretch is not None and stretch.surely else self._smooth
 
     @property
     def refusal(self) -> str:
@@ -99,6 +103,11 @@ class LensWatch:
             self._together.doubt, [given.focal_length, given.aspect_ratio]
         ).tolist()
         return replace(given, focal_length=min(length, 1.0), aspect_ratio=min(aspect, 1.0))
+
+    def errors_of(self, declared: ErrorModes | None) -> LandmarkErrors | None:
+        """Return errors that landmarks share: those declared, and a stretch if frames show one."""
+        stretch = None if self._together is None else self._together.stretch
+        return declared if stretch is None else stretch._replace(beside=declared)
 
     def widened(self, found: Estimate, points: Array) -> Estimate:
         """Return a frame whose velocities allow for another camera matrix, if frames doubt K.

@@ -33,7 +33,7 @@ from rs_localizer.estimation.acceptance import (
 )
 from rs_localizer.estimation.calibration import (
     NO_EFFECT,
-    ErrorModes,
+    LandmarkErrors,
     calibration_effect,
     widened,
 )
@@ -92,7 +92,7 @@ class _Inputs(NamedTuple):
     prior: Prior | None
     expected_share: float
     rotation: RotationPrior | None
-    error_modes: ErrorModes | None
+    error_modes: LandmarkErrors | None
     parts: MovedParts | None
 
 
@@ -213,7 +213,7 @@ class Localizer:
         expected_share: float = 0.5,
         rotation: RotationPrior | None = None,
         stamps: Mapping[str, float] | None = None,
-        error_modes: ErrorModes | None = None,
+        error_modes: LandmarkErrors | None = None,
         parts: MovedParts | None = None,
     ) -> Estimate | Failure:
         """Localize as :meth:`localize`, however uncertain: the next frames may know better.

@@ -434,7 +434,7 @@ class Tracker:
                 share,
                 rotation,
                 stamps,
-                context.error_modes,
+                self.lens.errors_of(context.error_modes),
                 self._parts,
             )
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What frames after frames say of lens and map: named with both numbers, or nothing."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -75,6 +76,7 @@ def test_two_frames_that_another_matrix_explains_refuse_all_until_they_are_old()
         ("right: facing board", 110, 0, ""),
         ("squeezed by 2 %, corner", 110, 2, "fy over fx 0.98 times K's"),
         ("squeezed by 25 %, corner", 0, 6, "fy over fx 0.75 times K's"),
+        ("map stretched by 1 %, wall", 110, 10, "a map that is longer by"),
     ],
 )
 def test_what_motion_hides_within_a_frame_frames_together_tell(name, published, beyond, said):
@@ -122,6 +124,36 @@ def test_a_recording_with_gaps_shows_no_other_matrix(lost):
             pixels += random.normal(0.0, 0.3, pixels.shape)
             tracker.localize(10**12 + 33_333_333 * k, board, pixels)
             assert tracker.lens.fault == ""
+
+
+@pytest.mark.parametrize(("angle", "surely"), [(0.7, True), (1.57, False)])
+def test_a_map_that_is_longer_one_way_moves_as_frames_tell(angle, surely):
+    """Errors of a map of a board of 1 m, which is longer by 1 % at this angle, before 1.6 m."""
+    camera = rsl.Camera(1280, 720, [[900, 0, 639.5], [0, 900, 359.5], [0, 0, 1]], readout_time=0.02)
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 9), np.linspace(-0.3, 0.3, 6))
+    board = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    along = np.array([np.cos(angle), np.sin(angle), 0.0])
+    moved = np.r_[0.0, 0.0, 1.6, 0.2, -0.3, 0.1, -0.2, 0.2, 0.1, 0.5, 0.6, -0.3]
+    for share in (0.0, 0.01):
+        random = np.random.default_rng(1)
+        tracker, longer = Tracker(rsl.Localizer(camera)), share * np.outer(board @ along, along)
+        for k in range(24):
+            pixels = moving_board(board, moved, k / 30 - 0.4)
+            pixels += random.normal(0.0, 0.1, pixels.shape)
+            tracker.localize(10**12 + 33_333_333 * k, board + longer, pixels)
+        stretch = tracker.lens.errors_of(None)
+        if share == 0.0:
+            assert stretch is None
+            assert tracker.lens.fault == ""
+    # One half of it is a stretch that frames show, the other half that all is larger.
+    off = stretch.at(board + longer).sum(axis=2) - longer
+    assert np.linalg.norm(off) < 0.3 * np.linalg.norm(longer)
+    found = re.search(r"longer by (\S+) % along \((\S+), (\S+), (\S+)\)", tracker.lens.fault)
+    assert (found is not None) == surely
+    if found is not None:
+        size, *way = map(float, found.groups())
+        assert 0.8 < size < 1.1
+        assert abs(way @ along) > 0.98
 
 
 def test_poses_allow_for_a_focal_length_that_frames_doubt():

@@ -16,7 +16,7 @@ moves motion and smooth error by ``-H^-1 A^T b``. A smooth error of ``f`` deviat
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -51,6 +51,13 @@ _SAME = 0.001
 # A direction to sort landmarks by: no wall, floor or row of them is across it.
 _ASKEW = np.array([0.6180, 0.5698, 0.5417])
 _ASKEW /= np.linalg.norm(_ASKEW)
+
+
+class LandmarkErrors(Protocol):
+    """Independent errors that landmarks share."""
+
+    def at(self, points: Array) -> Array:
+        """Return by how much one deviation of each moves points (n,3): (n,3,k)."""
 
 
 class ErrorModes:

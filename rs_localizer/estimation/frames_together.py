@@ -31,6 +31,7 @@ from rs_localizer.core.lens import centre_of
 from rs_localizer.core.rig import Exposure
 from rs_localizer.core.state import MOVE, VELOCITIES
 from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.calibration import LandmarkErrors
 from rs_localizer.estimation.points import Observations, find_usable, packed
 from rs_localizer.estimation.projection import linearized
 
@@ -67,7 +68,7 @@ _CUBIC, _OF_CHANGE, _LIKE_MOTION = (-2.0, 1.0, -2.0), 0.15, 0.002
 # extent: bends and stretches (printed boards have 0.3 %).
 _READOUT, _LENGTH, _RATIO, _LENS, _MAP = 0, 1, 2, slice(3, 6), slice(6, 11)
 _ANY = (3.0, 0.5, 0.1)
-_BENT, _SHARED = 0.003, 11
+_BENT, _SHARED, _STRETCHED = 0.003, 11, slice(9, 11)
 _OF_K = slice(_LENGTH, _RATIO + 1)
 # Landmarks farther away than this many extents are moved like those there.
 _FAR = 2.0
@@ -85,6 +86,9 @@ _TURNED = 0.25
 # Errors of corners are alike in neighbouring images: before twelve real boards focal lengths are
 # off by up to 4.3 deviations without this factor, by 2.8 with it.
 _ALIKE = 1.6
+# Deviations beyond which a map is said to be stretched. Right ones have up to 1.7, before a camera
+# that vibrates up to 5.1 (36 recordings), maps that are longer by 1 % 7 to 19 after a second.
+_STRETCHED_SURELY = 6.0
 # Frames together may leave so many times the variance (px^2) that each leaves alone.
 _AS_GOOD = math.e
 # fy over fx changes as each changes by a half, the other way.
@@ -139,6 +143,40 @@ class _Landmarks(NamedTuple):
         bent = out[:, None] * bends[:, None, :]
         modes: Array = self.extent * np.dstack([bent, stretched, sheared])
         return modes
+
+
+class Stretch(NamedTuple):
+    """A map that is longer along one direction of its plane than it says."""
+
+    landmarks: _Landmarks
+    sizes: Array  # (2,) of stretch and shear, shares of lengths, beyond what may be chance
+    surely: bool
+    beside: LandmarkErrors | None = None  # that the map declares
+
+    def at(self, points: Array) -> Array:
+        """Return modes (n,3,k) of points (n,3): the stretch, and a map that is as much larger.
+
+        What stretches a map one way makes it larger, which no frame shows.
+        """
+        centre, axes, extent = self.landmarks
+        places = np.clip((points - centre) @ axes[:2].T, -_FAR * extent, _FAR * extent)
+        along, across = self.sizes
+        found = np.array([[along, across], [across, -along]])
+        larger = math.hypot(along, across) * np.eye(2)
+        modes: Array = np.stack([places @ each @ axes[:2] for each in (found, larger)], axis=2)
+        if self.beside is None:
+            return modes
+        return np.concatenate([self.beside.at(points), modes], axis=2)
+
+    def __str__(self) -> str:
+        along, across = self.sizes
+        turn = 0.5 * math.atan2(across, along)
+        x, y, z = np.array([math.cos(turn), math.sin(turn)]) @ self.landmarks.axes[:2]
+        return (
+            f"successive images fit a map that is longer by {200.0 * math.hypot(along, across):.2g}"
+            f" % along ({x:.2f}, {y:.2f}, {z:.2f}) than across: was it printed, measured or built "
+            "with another scale along one axis?"
+        )
 
 
 class _Linked(NamedTuple):
@@ -349,6 +387,8 @@ class FramesTogether:
         self._fit: _Fit | None = None
         self.matrix: Matrix | None = None
         """The matrix that frames tell to be the camera's instead of K; None: K may be right."""
+        self.stretch: Stretch | None = None
+        """How frames show the map to be stretched; None: by no more than chance."""
         self.doubt = np.zeros(2)
         """Logarithms of focal length and fy over fx, over K's, as far as frames doubt K; else 0."""
 
@@ -386,6 +426,13 @@ class FramesTogether:
         ratios = np.where(told, np.exp(fit.numbers[_OF_K]), 1.0)
         self.matrix = Matrix(*ratios.tolist()) if told.any() else None
         self.doubt = self._beyond(fit, _DOUBTFULLY)
+        sizes, deviations = fit.numbers[_STRETCHED], fit.deviations[_STRETCHED]
+        by_more = np.sqrt(np.maximum(sizes**2 - deviations**2, 0.0))
+        # Frames that do not tell the readout time are not of the motion between them, or at rest.
+        surely = float(np.linalg.norm(sizes / deviations)) > _STRETCHED_SURELY
+        surely &= bool(fit.deviations[_READOUT] < _TURNED)
+        stretch = Stretch(self._map, np.copysign(by_more, sizes), surely)
+        self.stretch = stretch if by_more.any() else None
 
     def _beyond(self, fit: _Fit, least: float, wider: float = 1.0) -> Array:
         """Return what of focal length and fy over fx (2,) lies beyond so many deviations, or 0."""

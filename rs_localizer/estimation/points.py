@@ -42,7 +42,7 @@ from rs_localizer.estimation.projection import (
 from rs_localizer.native import entry, kernel
 
 if TYPE_CHECKING:
-    from rs_localizer.estimation.calibration import ErrorModes
+    from rs_localizer.estimation.calibration import LandmarkErrors
     from rs_localizer.estimation.moved_part import MovedParts
 
 
@@ -272,7 +272,7 @@ class Observed:
     points: Array  # (n,3) as they were given
     usable: Usable  # what of these can be used
     rotation: RotationPrior | None  # what the rays are compensated by
-    error_modes: ErrorModes | None = None  # of the map
+    error_modes: LandmarkErrors | None = None  # of the map
     parts: MovedParts | None = None  # of the map, that lie elsewhere
 
     @property
