@@ -378,12 +378,14 @@ def _by_chance(observed: Observed, posterior: Posterior, wide: bool) -> Failure 
     gate = float(errors[inliers].max())
     circle = max((GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length) ** 2, 4.0 * gate)
     near, found = int(np.count_nonzero(errors <= circle)), int(np.count_nonzero(inliers))
-    chance = gate / circle
     if not wide and near <= found + _MARKER:
         return None
     # What fills a gate may be vibration, of which one readout tells as many numbers again.
     sample = PARAMETERS if wide else PARAMETERS // 2
-    if _surprise(near, found, sample, chance) > _LEAST_CHANCE:
+    # One point may fill the gate, as a near one does of a rough map: so many others fit better.
+    best, sizes = np.sort(errors[inliers]), (found, 3 * found // 4, found // 2)
+    surprises = [_surprise(near, k, sample, float(best[k - 1]) / circle) for k in sizes if k]
+    if max(surprises) > _LEAST_CHANCE:
         return None
     return Failure(
         Reason.MODEL_ERROR,

@@ -137,6 +137,21 @@ def test_noise_as_wide_as_rays_of_a_wide_lens_are(focal_length):
         assert off @ np.linalg.solve(result.covariance[:6, :6], off) < 22.5  # 99.9 %
 
 
+@pytest.mark.parametrize("seed", [4, 10, 11])
+def test_near_points_of_a_rough_map_do_not_make_the_others_fit_by_chance(seed):
+    """A street whose landmarks are off by 0.3 m, as declared: 5 m away by 30 px, at 60 m by 3."""
+    camera = rsl.Camera(640, 480, [[500, 0, 319.5], [0, 500, 239.5], [0, 0, 1]], readout_time=0.03)
+    rng = np.random.default_rng(seed)
+    pixels, depth = rng.uniform([0, 0], [639, 479], (100, 2)), rng.uniform(*np.log([5, 200]), 100)
+    points = np.column_stack([(pixels - [319.5, 239.5]) / 500.0, np.ones(100)])
+    points = np.exp(depth)[:, None] * points + rng.normal(0.0, 0.3, points.shape)
+    pixels[:30] = rng.uniform(0, [639, 479], (30, 2))  # mismatches
+    result = rsl.Localizer(camera, map_deviation=0.3).localize(points, pixels)
+    assert result, result
+    off = np.r_[Rotation.from_matrix(result.rotation).as_rotvec(), result.translation]
+    assert off @ np.linalg.solve(result.covariance[:6, :6], off) < 22.5  # 99.9 %
+
+
 def test_points_that_fit_by_chance_are_no_motion():
     random = np.random.default_rng(8)
     for _ in range(6):
