@@ -74,8 +74,17 @@ def _spread(kept: Array, every: Array) -> float:
     """Return the logarithm of how far inliers (m,3) spread in the map, beside all points (n,3)."""
     if len(kept) < 3:
         return -3.0
-    inner, outer = (max(float(each.var(axis=0).sum()), 1e-12) for each in (kept, every))
+    inner, outer = (max(_extent(each), 1e-12) for each in (kept, every))
     return min(max(0.5 * math.log(inner / outer), -3.0), 1.0)
+
+
+@entry
+def _extent(points: Array2) -> float:
+    """Return the sum of the variances of points (n,3) along the axes."""
+    total = 0.0
+    for axis in range(3):
+        total += np.var(points[:, axis])
+    return total
 
 
 def _innovation(estimate: Estimate, prior: Prior, added: Array) -> float:
@@ -106,30 +115,31 @@ class SeenLandmarks:
     """How often landmarks were seen, and how often they were matched."""
 
     def __init__(self) -> None:
-        self._rows: dict[float, int] = {}  # of landmarks, by key
-        self._counts = np.zeros((0, 2))  # seen, kept
+        self._keys = np.array([np.inf])  # of landmarks, in order; the last one is none's
+        self._counts = np.zeros((1, 2))  # seen, kept
 
     def add(self, keys: Array, kept: BoolArray) -> None:
         """Count the landmarks of a frame."""
-        rows, known = self._rows, len(self._counts)
-        place = np.array([rows.setdefault(key, len(rows)) for key in keys.tolist()], np.int64)
-        if len(rows) > known:
-            more = max(len(rows) - known, known)
-            self._counts = np.concatenate([self._counts, np.zeros((more, 2))])
+        place = np.searchsorted(self._keys, keys)
+        if (is_new := self._keys[place] != keys).any():
+            new = np.unique(keys[is_new])
+            before = np.searchsorted(self._keys, new)
+            self._keys = np.insert(self._keys, before, new)
+            self._counts = np.insert(self._counts, before, 0.0, axis=0)
+            place = np.searchsorted(self._keys, keys)
         self._counts[place] += np.column_stack([np.ones(len(keys)), kept])
-        if len(rows) > _MOST_LANDMARKS:  # those that are not in view
-            there = dict.fromkeys(keys.tolist())
-            self._counts = self._counts[[rows[key] for key in there]]
-            self._rows = {key: row for row, key in enumerate(there)}
+        if len(self._keys) > _MOST_LANDMARKS:  # those that are not in view
+            here = np.append(np.unique(place), len(self._keys) - 1)
+            self._keys, self._counts = self._keys[here], self._counts[here]
 
     def stale(self, keys: Array) -> BoolArray:
         """Return which landmarks, by key, were seen too often to be unmatched by chance."""
-        place = np.array([self._rows.get(key, -1) for key in keys.tolist()], np.int64)
-        found: BoolArray = place >= 0
+        place = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)  # NaN is behind
+        found: BoolArray = self._keys[place] == keys
         if found.any():
-            seen, kept = self._counts.T
-            missed = 1.0 - kept.sum() / seen.sum()
-            found &= ((kept == 0) & (missed**seen < _BY_CHANCE))[place]
+            seen, kept = self._counts[place].T
+            every = self._counts.sum(axis=0)
+            found &= (kept == 0) & ((1.0 - every[1] / every[0]) ** seen < _BY_CHANCE)
         return found
 
 
