@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, Array1, Array2
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.rig import Rig
 from rs_localizer.core.scanning import ACROSS, REVERSED, ScanDirection
@@ -46,6 +46,7 @@ from rs_localizer.estimation.points import find_usable, packed
 from rs_localizer.estimation.prior import state_in
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.stabilizer import RowRotation, RowRotations
+from rs_localizer.native import entry
 
 # If the readout time is off by more than this share, single frames are better than tracked ones.
 # The errors of a hand's angular velocity, tracked over single, are 0.95, 1.3 and 1.5 if it is off
@@ -59,6 +60,7 @@ _GATE = 3.0
 # by some 0.1 rad, or shares of the depth, per readout, at a noise of 0.3 px.
 _OF_USUAL_SPEEDS = 0.3 / 0.1
 _LEAST_NOISE, _ROUNDS = 0.1, 4  # px, no real error is smaller; rounds of robust weights
+_OF_NORMAL = 0.455  # median of the squares of a normal distribution
 # Neighbours that are farther away (s) tell little. Between closer ones, unsure stamps hide the way:
 # at 100 Hz nothing was told within 4 s; by every second image, 20 ms are measured as 19.6 +- 1.2.
 # The second is so small that of 30 Hz whose stamps jitter by 5 ms, one image in fifty is lost.
@@ -324,33 +326,10 @@ class ShutterWatch:
         wanders = (1.0 - _ALIKE**2) * self._any[_OTHERWISE, _OTHERWISE]
         known[_OTHERWISE, _OTHERWISE] += self._unlike * wanders
         prior = self._mean * np.repeat([1.0, _ALIKE, 1.0], [2, 12, 3])
-        mean, fitted, information = prior, np.zeros(18), np.zeros((18, 18))
-        variance = 0.0
-        for k in range(_ROUNDS):
-            speed = way.speed + mean[_STAMPS] @ way.by_stamps
-            moved = np.zeros((12, _ESTIMATED))  # way over rows, and over columns, by all that
-            moved[:6, 0] = moved[6:, 1] = speed
-            moved[:, _OTHERWISE] = np.eye(12)
-            moved[:6, _STAMPS], moved[6:, _STAMPS] = mean[_TIMES, None, None] * way.by_stamps.T
-            ways = np.outer(mean[_TIMES], speed).ravel()
-            ways += mean[_OTHERWISE] + moved @ (prior - mean)
-            expected = moved @ known @ moved.T
-            information[6:, 6:] = np.linalg.inv(expected)
-            off = now.off - now.rows[:, 6:] @ ways
-            left = now.off - now.rows @ fitted if k else off
-            if not k:
-                variance = float(np.median(left**2)) / 0.455  # of a normal distribution
-            variance = max(variance, _LEAST_NOISE**2)
-            weights = 1.0 / (variance + left**2 / 9.0)
-            weighed = (now.rows * weights[:, None]).T
-            covariance = np.linalg.inv(weighed @ now.rows + information)
-            step = covariance @ (weighed @ off)
-            fitted = step + np.r_[np.zeros(6), ways]
-            variance = float(weights @ (now.off - now.rows @ fitted) ** 2 / np.sum(weights))
-            gain = known @ moved.T @ information[6:, 6:]
-            mean = prior + gain @ step[6:]
+        mean, self._covariance, speed, weights = _measured(
+            now.rows, now.off, prior, known, way.speed, way.by_stamps
+        )
         self._mean = mean
-        self._covariance = known - gain @ (expected - covariance[6:, 6:]) @ gain.T
         changed = (mean - prior)[_OTHERWISE] ** 2 / wanders.diagonal()
         more = min(float(np.mean(changed)), _MOST_UNLIKELY * self._unlike) - self._unlike
         self._unlike = max(self._unlike + _LEARNING * more, 1.0)
@@ -483,6 +462,49 @@ class ShutterWatch:
         self.fault = f"estimated readout time {measured}{named} differs from readout_time = "
         self.fault += f"{1e3 * usual:g} ms"
         return kind
+
+
+@entry
+def _measured(
+    rows: Array2, off: Array1, prior: Array1, known: Array2, speed: Array1, by_stamps: Array2
+) -> tuple[Array, Array, Array, Array]:
+    """Return what is estimated (17,) after a frame, its covariance, speed and weights.
+
+    Args:
+        rows: (2 n,18) px, and errors (2 n,): of :class:`_Look`.
+        prior: (17,) and its covariance, likewise.
+        speed: (6,) and its derivatives (3,6), of :class:`_Way`.
+    """
+    mean, fitted, information = prior, np.zeros(18), np.zeros((18, 18))
+    along, moved, variance = rows[:, 6:].copy(), np.zeros((12, _ESTIMATED)), 0.0
+    moved[:, _OTHERWISE] = np.eye(12)  # way over rows, and over columns, by all that
+    for k in range(_ROUNDS):
+        own, ways = speed + mean[_STAMPS] @ by_stamps, prior[_OTHERWISE].copy()
+        for axis in range(2):
+            of_axis = slice(6 * axis, 6 * axis + 6)
+            moved[of_axis, axis], moved[of_axis, _STAMPS] = own, mean[axis] * by_stamps.T
+            ways[of_axis] += prior[axis] * own + mean[axis] * (
+                (prior[_STAMPS] - mean[_STAMPS]) @ by_stamps
+            )
+        expected = moved @ known @ moved.T
+        information[6:, 6:] = np.linalg.inv(expected)
+        rest = off - along @ ways
+        left = off - rows @ fitted if k > 0 else rest
+        if k == 0:
+            ordered, middle = np.sort(left**2), len(left) // 2
+            variance = 0.5 * (ordered[middle - 1] + ordered[middle]) / _OF_NORMAL
+        variance = max(variance, _LEAST_NOISE**2)
+        weights = 1.0 / (variance + left**2 / 9.0)
+        weighed = rows * weights.reshape(-1, 1)
+        covariance = np.linalg.inv(weighed.T @ rows + information)
+        step = covariance @ (rest @ weighed)
+        fitted = step.copy()
+        fitted[6:] += ways
+        variance = np.sum(weights * (off - rows @ fitted) ** 2) / np.sum(weights)
+        gain = known @ moved.T @ information[6:, 6:].copy()
+        mean = prior + gain @ step[6:]
+    taken = expected - covariance[6:, 6:]
+    return mean, known - gain @ taken @ gain.T, own, weights
 
 
 def _vibrates(found: Estimate) -> bool:

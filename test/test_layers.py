@@ -36,7 +36,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "integrity": {"core", "config", "estimation", "native"},
     "repeated_images": {"core", "estimation"},
     "lens_watch": {"core", "config", "estimation"},
-    "shutter_watch": {"core", "estimation"},
+    "shutter_watch": {"core", "estimation", "native"},
     "tracking": METHOD - {"tracking", "inertial"},
     "io": {"core"},
     "settings": {"config", "io"},

@@ -17,7 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, Array2, Array3
+from rs_localizer.estimation.robust import eliminate
+from rs_localizer.native import entry, kernel
 
 # Frames that are compared, and least number of them.
 _LAST, _LEAST = 30, 8
@@ -25,6 +27,8 @@ _LAST, _LEAST = 30, 8
 # ones (hands before right cameras: at most 4.5), and surely at twice as many, if also the logarithm
 # of the odds against vibration is more than this.
 _LIKELY = 5.0
+# What another shutter adds is no other number than the mean below this part of the information.
+_LEAST_TOLD = 1e-9
 
 
 class RowRotation(NamedTuple):
@@ -71,45 +75,82 @@ class RowRotations:
         """Take the rotation of the next frame, ``readouts`` times readouts per interval later."""
         self._last.append(one)
         turned, covariances, by_shutter = map(np.array, zip(*self._last, strict=True))
-        weights = np.linalg.inv(covariances[:, :3, :3])
-        smooth, rate = _likeness(turned[:, :3], weights)
+        weights = np.linalg.inv(covariances[:, :3, :3]), np.linalg.inv(covariances[:, 3:, 3:])
+        smooth, rate = _likeness(turned[:, :3].copy(), weights[0])
         self.most = rate if smooth > _LIKELY else 0.0
         if not self.are_enough:
             return
-        rates = _varying(turned[:, :3], weights, by_shutter[:, :3])
-        self._smooth, self.rate = _likeness(rates, weights)
-        of_stabilizer = np.gradient(rates, axis=0) * readouts
-        weights = np.linalg.inv(covariances[:, 3:, 3:])
-        bends = _varying(turned[:, 3:] - of_stabilizer, weights, by_shutter[:, 3:])
-        vibrating = (math.pi * readouts * self.rate) ** 2 / 3.0 * np.eye(3)
-        some, none = (_fit(bends, covariances[:, 3:, 3:] + more) for more in (vibrating, 0.0))
-        self._bent = some - none
+        self._smooth, self.rate, self._bent = _compared(
+            turned, weights, covariances, by_shutter, readouts
+        )
         is_new = self._smooth > 2.0 * _LIKELY and self._bent < -_LIKELY
         self.is_certain = is_new or (self.is_certain and self._smooth > _LIKELY)
 
 
-def _likeness(values: Array, weights: Array) -> tuple[float, float]:
+@entry
+def _compared(
+    turned: Array2, weights: tuple[Array3, Array3], covariances: Array3, by_shutter: Array3,
+    readouts: float,
+) -> tuple[float, float, float]:  # fmt: skip
+    """Return likeness and rms of rotations (n,6) but for a shutter's, and odds of vibration."""
+    count = len(turned)
+    rates = _varying(turned[:, :3].copy(), weights[0], by_shutter)
+    smooth, rate = _likeness(rates, weights[0])
+    of_stabilizer = np.empty((count, 3))
+    for i in range(count):
+        before, after = max(i - 1, 0), min(i + 1, count - 1)
+        of_stabilizer[i] = (rates[after] - rates[before]) * (readouts / (after - before))
+    bends = _varying(turned[:, 3:] - of_stabilizer, weights[1], by_shutter[:, 3:].copy())
+    vibrating = (math.pi * readouts * rate) ** 2 / 3.0
+    return smooth, rate, _density(bends, covariances, vibrating) - _density(bends, covariances, 0.0)
+
+
+@entry
+def _likeness(values: Array2, weights: Array3) -> tuple[float, float]:
     """Return how alike neighbours of values (n,3) are, in deviations, and their rms.
 
     Independent errors of neighbours leave their product as it is.
     """
-    whitened = np.einsum("nij,ni->nj", np.linalg.cholesky(weights), values)
-    pairs = float(np.sum(whitened[1:] * whitened[:-1])) / math.sqrt(3.0 * len(values))
-    square = float(np.sum(values[1:] * values[:-1])) / max(len(values) - 1, 1)
-    return pairs, math.sqrt(max(square, 0.0))
+    pairs, square, before = 0.0, 0.0, np.zeros(3)
+    for i in range(len(values)):
+        factor = weights[i].copy()
+        eliminate(factor, 3)
+        whitened = np.triu(factor) @ values[i]
+        if i > 0:
+            pairs += np.sum(whitened * before)
+            square += np.sum(values[i] * values[i - 1])
+        before = whitened
+    square /= max(len(values) - 1, 1)
+    return pairs / math.sqrt(3.0 * len(values)), math.sqrt(max(square, 0.0))
 
 
+@kernel
 def _varying(values: Array, weights: Array, by_shutter: Array) -> Array:
     """Return values (n,3) without their mean, and without what another shutter adds."""
-    columns = np.tile(np.eye(3), (len(values), 1, 1))
-    design = np.concatenate([columns, by_shutter], axis=2)
-    weighed = np.swapaxes(design, 1, 2) @ weights
-    known = (weighed @ design).sum(axis=0), (weighed @ values[:, :, None]).sum(axis=0)
-    rest: Array = values - (design @ np.linalg.lstsq(*known, rcond=1e-9)[0])[:, :, 0]
+    normal, right, design = np.zeros((5, 5)), np.zeros(5), np.eye(3, 5)
+    for i in range(len(values)):
+        design[:, 3:] = by_shutter[i, :3]
+        weighed = design.T @ weights[i]
+        normal, right = normal + weighed @ design, right + weighed @ values[i]
+    told, axes = np.linalg.eigh(normal)
+    least = _LEAST_TOLD * told[4]
+    found = axes @ ((right @ axes) * np.where(told > least, 1.0 / np.maximum(told, least), 0.0))
+    rest = values - found[:3]
+    for i in range(len(values)):
+        rest[i] -= by_shutter[i, :3].copy() @ found[3:]
     return rest
 
 
-def _fit(values: Array, covariances: Array) -> float:
-    """Return the logarithm of the density of values (n,3), but for a constant."""
-    squares = np.sum(values * np.linalg.solve(covariances, values[:, :, None])[:, :, 0])
-    return -0.5 * float(squares + np.linalg.slogdet(covariances)[1].sum())
+@kernel
+def _density(values: Array, covariances: Array, more: float) -> float:
+    """Return the logarithm of the density of values (n,3) but for a constant; each variance has
+    ``more``.
+    """
+    total, equations = 0.0, np.empty((3, 4))
+    for i in range(len(values)):
+        equations[:, :3] = covariances[i, 3:, 3:] + more * np.eye(3)
+        equations[:, 3] = values[i]
+        eliminate(equations, 3)
+        for k in range(3):
+            total -= 0.5 * equations[k, 3] ** 2 + math.log(equations[k, k])
+    return total
