@@ -29,6 +29,7 @@ the settings'. Its mean and its region are weighed as those of one frame (docs/e
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import NamedTuple
 
@@ -56,7 +57,7 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.gaussian import Gaussians, mixture
 from rs_localizer.estimation.hypotheses import TEMPER
 from rs_localizer.estimation.prior import PriorTerms, add_prior, state_in
-from rs_localizer.estimation.robust import apply_step, inverted
+from rs_localizer.estimation.robust import apply_step, inverse_of, inverted
 from rs_localizer.native import entry, kernel
 
 LENGTH = 6
@@ -126,12 +127,10 @@ class MotionSample(NamedTuple):
 
 
 class _Solved(NamedTuple):
-    """Filter and smoother of n samples, behind the start (n + 1 rows)."""
+    """Motions of n samples, behind the start (n + 1 rows)."""
 
-    filtered: Array  # (n+1,24)
+    states: Array  # (n+1,24)
     covariances: Array  # (n+1,18,18)
-    smoothed: Array  # (n+1,24)
-    smoothed_covariances: Array  # (n+1,18,18)
     deviations: Array  # (4,) as they were learnt
     surprise: float  # squared distance of the last sample from its prediction
     evidence: float  # logarithm, of all samples
@@ -154,7 +153,7 @@ class MotionWindow:
     configured: Array
     deviations: Array
     samples: tuple[MotionSample, ...] = ()
-    solved: tuple[_Solved, ...] = ()  # by accelerations: as learnt, and larger ones
+    solved: tuple[_Solved, ...] = ()  # filtered, by accelerations: as learnt, and larger ones
     readout_share: float = 0.0
     mixed: dict[int, Gaussian] = field(default_factory=dict)  # by row, those that were asked for
 
@@ -188,24 +187,31 @@ class MotionWindow:
         """Return the motion so many frames before the last one, given all frames."""
         if not self.solved:
             return self.start
-        row = len(self.samples) - frames
-        if row not in self.mixed:
-            odds = np.zeros(len(self.solved))
-            odds[0] = _ODDS
-            # From where the camera is: a map's origin may be thousands of kilometres away.
-            states = np.array([one.smoothed[row] for one in self.solved])
-            centre = -rotation_of(states[0]).T @ states[0, STATE_TRANSLATION]
-            for state in states:
-                state[STATE_TRANSLATION] += rotation_of(state) @ centre
-            parts = Gaussians(
-                states, np.zeros((len(odds), 0)),
-                np.array([one.smoothed_covariances[row] for one in self.solved]),
-                np.array([one.evidence for one in self.solved]),
-            )  # fmt: skip
-            whole = mixture(parts, odds, TEMPER)
-            whole.state[STATE_TRANSLATION] -= rotation_of(whole.state) @ centre
-            self.mixed[row] = Gaussian(self.times[row], whole.state, whole.covariance)
-        return self.mixed[row]
+        last = len(self.samples)
+        if last - frames not in self.mixed:
+            solved, rows = self.solved, range(last, last + 1)
+            if frames:  # which later ones tell of, too
+                solved, rows = self._by_samples(0, True), range(last)
+            for row in rows:
+                self.mixed[row] = self._mixed(solved, row)
+        return self.mixed[last - frames]
+
+    def _mixed(self, solved: Sequence[_Solved], row: int) -> Gaussian:
+        odds = np.zeros(len(solved))
+        odds[0] = _ODDS
+        # From where the camera is: a map's origin may be thousands of kilometres away.
+        states = np.array([one.states[row] for one in solved])
+        centre = -rotation_of(states[0]).T @ states[0, STATE_TRANSLATION]
+        for state in states:
+            state[STATE_TRANSLATION] += rotation_of(state) @ centre
+        parts = Gaussians(
+            states, np.zeros((len(odds), 0)),
+            np.array([one.covariances[row] for one in solved]),
+            np.array([one.evidence for one in solved]),
+        )  # fmt: skip
+        whole = mixture(parts, odds, TEMPER)
+        whole.state[STATE_TRANSLATION] -= rotation_of(whole.state) @ centre
+        return Gaussian(self.times[row], whole.state, whole.covariance)
 
     def foreseen(self, time_ns: int) -> Gaussian:
         """Return the motion that an image at a time after the last frame may have.
@@ -249,13 +255,18 @@ class MotionWindow:
         """Return the window with one more frame, and with learnt accelerations."""
         start, samples = self.start, (*self.samples, sample)
         if len(samples) >= LENGTH:
-            first, solved = samples[0], self.solved[0]
-            start = Gaussian(first.time_ns, solved.filtered[1], solved.covariances[1])
+            states, covariances, *_ = self.solved[0]
+            start = Gaussian(samples[0].time_ns, states[1], covariances[1])
             samples = samples[1:]
         return replace(self, start=start, samples=samples)._through(_ROUNDS)
 
     def _through(self, rounds: int) -> MotionWindow:
-        """Return the window with the motion by its samples, learning from them in some rounds.
+        """Return the window with the motion by its samples, learning from them in some rounds."""
+        solved = self._by_samples(rounds, False)
+        return replace(self, deviations=solved[0].deviations, solved=solved, mixed={})
+
+    def _by_samples(self, rounds: int, smooths: bool) -> tuple[_Solved, ...]:
+        """Return the motions by all samples or, not smoothed, by those until each.
 
         The filter, which goes on, is that of the accelerations that were learnt.
         """
@@ -265,11 +276,11 @@ class MotionWindow:
         found = list[_Solved]()
         for grown in _GROWN:
             found.append(_Solved(*_solve(
-                seconds, states, informations, gradients, self.start.state,
-                self.start.covariance, scales, self.readout_share, 0 if found else rounds, grown,
+                seconds, states, informations, gradients, self.start.state, self.start.covariance,
+                scales, self.readout_share, 0 if found else rounds, smooths, grown,
             )))  # fmt: skip
             scales = np.stack([self.configured, found[0].deviations])
-        return replace(self, deviations=found[0].deviations, solved=tuple(found), mixed={})
+        return tuple(found)
 
 
 @entry
@@ -355,52 +366,52 @@ def singer(seconds: float, fading: float) -> Array:
 @entry
 def _solve(
     seconds: Array1, states: Array2, informations: Array3, gradients: Array2, start: Array1,
-    start_covariance: Array2, scales: Array2, readout_share: float, rounds: int, grown: float,
-) -> tuple[Array, Array, Array, Array, Array, float, float]:  # fmt: skip
-    """Filter, smoother and learnt deviations: the fields of :class:`_Solved`.
+    start_covariance: Array2, scales: Array2, readout_share: float, rounds: int, smooths: bool,
+    grown: float,
+) -> tuple[Array, Array, Array, float, float]:  # fmt: skip
+    """Filter, learn deviations and perhaps smooth: the fields of :class:`_Solved`.
 
     Args:
         seconds: (n,) of each transition.
         scales: (2,4) deviations by the settings, and as they are known.
         rounds: of learning.
+        smooths: all samples tell of all motions.
         grown: factor of the deviations of the last transitions.
     """
     count, configured, deviations = len(seconds), scales[0], scales[1].copy()
     square, row = (count + 1, PARAMETERS, PARAMETERS), (count + 1, STATE_SIZE)
-    predicted, filtered, smoothed = np.empty(row), np.empty(row), np.empty(row)
+    predicted, filtered = np.empty(row), np.empty(row)
     predictions, transports, knowns = np.empty(square), np.empty(square), np.empty(square)
-    covariances, spreads = np.empty(square), np.empty(square)
-    filtered[0], covariances[0], surprise = start, start_covariance, 0.0
+    covariances = np.empty(square)
     while True:
-        evidence = 0.0
+        filtered[0], covariances[0], surprise, evidence = start, start_covariance, 0.0, 0.0
         for k in range(count):
             own = enlarged(deviations, configured, grown if k >= count - _RECENT else 1.0)
             predicted[k], predictions[k], transports[k] = _predicted(
                 filtered[k], covariances[k], seconds[k], own, readout_share, FADING
             )
-            known, told = inverted(predictions[k]), informations[k]
-            knowns[k], covariances[k + 1] = known, inverted(told + known)
+            known, narrower = inverse_of(predictions[k])
+            covariances[k + 1], left = inverse_of(informations[k] + known)
             right = gradients[k] + known @ step_between(states[k], predicted[k])
             step = covariances[k + 1] @ right
-            filtered[k + 1] = apply_step(states[k], step)
+            filtered[k + 1], knowns[k] = apply_step(states[k], step), known
             moved = step_between(predicted[k], filtered[k + 1])
             surprise = np.sum(moved * (known @ moved))
-            twice = 2.0 * gradients[k]
-            surprise += np.sum(step * (told @ step - twice))
-            volume = np.linalg.slogdet(known)[1] + np.linalg.slogdet(covariances[k + 1])[1]
-            evidence += 0.5 * (volume - surprise)
-        smoothed[count], spreads[count] = filtered[count], covariances[count]
+            surprise += np.sum(step * (informations[k] @ step - 2.0 * gradients[k]))
+            evidence -= narrower + left + 0.5 * surprise
+        if rounds == 0 and not smooths:
+            break
         scores, weight = np.zeros((4, 3)), 1.0
         for k in range(count - 1, -1, -1):
-            known, after = knowns[k], spreads[k + 1]
-            step = step_between(predicted[k], smoothed[k + 1])
+            known, after = knowns[k], covariances[k + 1].copy()
+            step = step_between(predicted[k], filtered[k + 1])
             pull, spread = known @ step, known - known @ after @ known
             _score(seconds[k], deviations, pull, spread, weight, scores)
             weight *= _FORGETTING
             gain = covariances[k] @ transports[k].T @ known
-            smoothed[k] = apply_step(filtered[k], gain @ step)
+            filtered[k] = apply_step(filtered[k], gain @ step)
             whole = covariances[k] + gain @ (after - predictions[k]) @ gain.T
-            spreads[k] = 0.5 * (whole + whole.T)
+            covariances[k] = 0.5 * (whole + whole.T)
         if rounds == 0:
             break
         ratios = 1.0 + (scores[:, 0] - scores[:, 1]) / (scores[:, 2] + _DOUBT)
@@ -410,7 +421,7 @@ def _solve(
         deviations[:3] = np.maximum(deviations[:3], _LEAST_SHARE * deviations[:3].max())
         is_settled = np.max(np.abs(np.log(deviations / before))) < _SETTLED
         rounds = 0 if is_settled else rounds - 1
-    return filtered, covariances, smoothed, spreads, deviations, surprise, evidence
+    return filtered, covariances, deviations, surprise, evidence
 
 
 @entry
