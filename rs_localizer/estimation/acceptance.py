@@ -23,6 +23,7 @@ from rs_localizer.core.state import (
     STATE_LINEAR,
     STATE_LINEAR_ACCELERATION,
     STATE_TRANSLATION,
+    TURN,
     VELOCITIES,
     rotation_of,
 )
@@ -138,7 +139,10 @@ def uncertain(estimate: Estimate) -> Failure | None:
     What points do not tell because the camera may move, its covariance says: a global-shutter
     estimator, which takes the camera for one at rest, would publish that pose.
     """
-    deviation, still, most = estimate.orientation_deviation, estimate.still_deviation, MOST_TURN
+    still, most = estimate.still_deviation, MOST_TURN
+    if np.trace(estimate.covariance[TURN, TURN]) <= most**2:  # less than that about any axis
+        return None
+    deviation = estimate.orientation_deviation
     if deviation <= most or (still <= most and deviation <= _OPEN * most):
         return None
     return Failure(

@@ -182,11 +182,13 @@ def _effect(
     """
     smooth, is_beside = fitted
     size, last = len(every), smooth + PARAMETERS
-    whole = np.zeros((size + smooth, size + smooth))
+    columns = size + smooth if is_beside else size
+    whole = np.zeros((columns, columns))
     whole[:size, :size] = every
     for k in range(smooth):
         whole[k, k] += variance
-        whole[k, size + k] = variance if is_beside else 0.0
+        if is_beside:
+            whole[k, size + k] = variance
     eliminate(whole, smooth)  # for all speeds
     beside, alone = np.zeros((PARAMETERS, PARAMETERS)), np.zeros((PARAMETERS, PARAMETERS))
     for k in range(len(of_speeds)):

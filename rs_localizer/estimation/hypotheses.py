@@ -65,6 +65,7 @@ from rs_localizer.estimation.robust import (
     WIDEST_GATE,
     apply_step,
     best_motion,
+    solve_positive,
 )
 
 # Logarithm of the odds of rest against each typical speed before any frame: errors of maps that no
@@ -481,6 +482,5 @@ def _clearly_moving(given: _Given) -> bool:
     spread = given.best.covariance[place, place]
     part = float(np.diagonal(given.terms.informations[0])[place] @ np.diagonal(spread))
     velocities = given.best.state[POSE_SIZE - POSE.stop :][place]
-    return part < _LITTLE_OF_THE_PRIOR and bool(
-        velocities @ np.linalg.solve(spread, velocities) > _CLEARLY_MOVING
-    )
+    far = velocities @ solve_positive(spread.copy(), velocities)[0]
+    return part < _LITTLE_OF_THE_PRIOR and bool(far > _CLEARLY_MOVING)

@@ -96,10 +96,10 @@ def pools_of(
     for place in range(len(observations.mounts.axes)):
         here = observations.camera == place
         tau = observations.tau[here]
+        row_range = float(np.ptp(tau)) if len(tau) else 0.0
         for points, ranked in groups:
             own = points[here[points]]
             if len(own) >= size:
-                row_range = float(tau.max() - tau.min())
                 pools.append(Pool.of(own, row_range, len(own) / len(points), ranked))
     return pools
 
@@ -313,7 +313,7 @@ def search(
             best, shares = found, None
         if shares is None and best.found:
             near = observations.within(best.state, final)
-            shares = [float(np.mean(near[each.points])) for each in pools]
+            shares = [np.count_nonzero(near[each.points]) / len(each.points) for each in pools]
         bar = min(bar, costs[0])
         left = draws.most - int(drawn.sum())
         # The chance that none of the samples held inliers alone.

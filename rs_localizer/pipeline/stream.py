@@ -104,10 +104,11 @@ class Stream:
         if places and not 0.0 <= 1e-9 * (time_ns - places[-1][0]) < _LONGEST_STEP:
             places.clear()
             self._scale = ""
-        ahead = (points[estimate.inliers] - estimate.position) @ estimate.rotation[2]
-        depth = float(np.median(ahead)) if len(ahead) else 0.0
-        is_due = not places or 1e-9 * (time_ns - places[-1][0]) > _APART
-        if depth > _NEAR and is_due and (found := alone()):
+        depth = 0.0
+        if not places or 1e-9 * (time_ns - places[-1][0]) > _APART:
+            ahead = (points[estimate.inliers] - estimate.position) @ estimate.rotation[2]
+            depth = float(np.median(ahead)) if len(ahead) else 0.0
+        if depth > _NEAR and (found := alone()):
             places.append((time_ns, found.position, found.covariance[3:6, 3:6].trace()))
             while 1e-9 * (time_ns - places[0][0]) > _WINDOW:
                 places.popleft()
