@@ -26,7 +26,7 @@ import rs_localizer as rsl
 from benchmarks.aided import believed
 from benchmarks.independent.cameras import Camera
 from benchmarks.independent.motions import IntArray, Moving, steady
-from benchmarks.independent.rigs import Mounted, Scene, Views, middle_of, views
+from benchmarks.independent.rigs import Mounted, Scene, Views, middle_of, noisy_frames, views
 from benchmarks.independent.rotations import Array, exponential, logarithm
 from rs_localizer.config import CalibrationErrors
 
@@ -154,15 +154,7 @@ def run(name: str, scene: Scene, noise: float, outliers: float, frames: int, see
     middle, localizer = middle_of(mounted), rsl.Localizer(_rig(mounted), _EXACT)
     states = motions.states(np.arange(frames), np.full(frames, middle))
     ratios, inside, reasons, seconds = [], [], Counter[str](), 0.0
-    for frame in range(frames):
-        parts = {}
-        for camera, view in seen.items():
-            shown = view.visible[frame]
-            pixels = view.exact[frame, shown]
-            pixels = pixels + noise * rng.normal(size=pixels.shape)
-            wrong = rng.uniform(size=len(pixels)) < outliers
-            pixels[wrong] = rng.uniform([0, 0], [639, 479], (wrong.sum(), 2))
-            parts[camera] = view.points[frame, shown], pixels
+    for frame, parts in enumerate(noisy_frames(seen, noise, outliers, rng)):
         start = time.thread_time()
         result = localizer.localize(parts)
         seconds += time.thread_time() - start

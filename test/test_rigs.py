@@ -18,7 +18,7 @@ from benchmarks.aided import believed
 from benchmarks.independent.cameras import Camera as TrueCamera
 from benchmarks.independent.cameras import Scan
 from benchmarks.independent.motions import hand, steady
-from benchmarks.independent.rigs import Mounted, Scene, middle_of, views
+from benchmarks.independent.rigs import Mounted, Scene, middle_of, noisy_frames, views
 from benchmarks.independent.rotations import exponential, logarithm
 from rs_localizer.config import CalibrationErrors
 from rs_localizer.core.types import Estimate
@@ -50,18 +50,7 @@ def frames(mounted, make, count, points=40, noise=0.0, scene=Scene.RICH, seed=0,
     rng = np.random.default_rng(seed)
     motions, begin = make(count, rng), np.zeros(count)
     seen = views(mounted, motions, begin, points, scene, rng)
-    made = []
-    for frame in range(count):
-        parts = {}
-        for name, view in seen.items():
-            shown = view.visible[frame]
-            pixels = view.exact[frame, shown]
-            pixels = pixels + noise * rng.normal(size=pixels.shape)
-            wrong = rng.uniform(size=len(pixels)) < outliers
-            pixels[wrong] = rng.uniform([0, 0], [640, 480], (wrong.sum(), 2))
-            parts[name] = view.points[frame, shown], pixels
-        made.append(parts)
-    return made, motions
+    return list(noisy_frames(seen, noise, outliers, rng)), motions
 
 
 def fast(count, rng):

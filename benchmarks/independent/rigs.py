@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -58,6 +58,28 @@ class Views:
     points: Array  # (f,n,3)
     exact: Array  # (f,n,2)
     visible: BoolArray  # (f,n)
+    last_pixel: Array  # (2,)
+
+
+def noisy_frames(
+    seen: Mapping[str, Views], noise: float, outliers: float, rng: np.random.Generator
+) -> Iterator[dict[str, tuple[Array, Array]]]:
+    """Yield what each frame shows: points (n,3) and pixels (n,2) of each camera.
+
+    Args:
+        noise: px.
+        outliers: share of the points that are shown anywhere.
+    """
+    for frame in range(len(next(iter(seen.values())).points)):
+        parts = {}
+        for name, view in seen.items():
+            shown = view.visible[frame]
+            pixels = view.exact[frame, shown]
+            pixels = pixels + noise * rng.normal(size=pixels.shape)
+            wrong = rng.uniform(size=len(pixels)) < outliers
+            pixels[wrong] = rng.uniform(0.0, view.last_pixel, (wrong.sum(), 2))
+            parts[name] = view.points[frame, shown], pixels
+        yield parts
 
 
 def middle_of(rig: Mapping[str, Mounted]) -> float:
@@ -95,5 +117,5 @@ def views(
         body = centre + depth[..., None] * rays
         points = position[:, None] + np.einsum("fij,fnj->fni", rotation, body)
         exact = mounted.seen(motions, which, begin, points)
-        result[name] = Views(points, exact, visible(mounted.camera, exact))
+        result[name] = Views(points, exact, visible(mounted.camera, exact), size)
     return result
