@@ -252,8 +252,11 @@ class CameraFrames(FrameLocalizer):
             text = f"pose or map are wrong with a probability of {result.integrity:.0%}"
             self._notice(Notice.DOUBTFUL, text)
         elif not self._scale_is_odd:  # which also looks like a moved part of the map
-            gone = stale_landmarks(cloud, self._tracker.stale(cloud.points))
-            for said in filter(None, (gone, moved_landmarks(cloud, self._tracker.moved))):
+            names = () if self._tags is None else self._tags.names
+            stale = self._tracker.stale(cloud.points)
+            gone = stale_landmarks(cloud, stale, result, self._camera, names)
+            moved = moved_landmarks(cloud, self._tracker.moved, names)
+            for said in filter(None, (gone, moved)):
                 self._notice(Notice.STALE_LANDMARKS, said)
         if result.left_out:
             self._notice(Notice.DOUBTFUL, result.left_out)

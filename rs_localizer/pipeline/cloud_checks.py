@@ -2,14 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Oddities of correspondences that a reader of clouds cannot see, and that refuse no frame."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from rs_localizer.core.arrays import BoolArray
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import centre_of, off_centre
 from rs_localizer.core.reasons import Notice
+from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.moved_part import MovedPart
 from rs_localizer.io.clouds import Correspondences
+from rs_localizer.pipeline.what_fits import ids_of
 
 # Coordinates in single precision shall tell millimetres, in m: they do as far as 8 km.
 _FINE = 0.00097
@@ -67,17 +71,90 @@ def oddities(
 
 # Most landmarks that are named.
 _NAMED = 12
+# So many corners of a marker that is elsewhere are never matched; others may be, by chance.
+_OF_MARKER = 2
+# Corners lie in a plane: what is out of it by such a share is rounding.
+_FLAT = 1e-3
+# Corners that are seen where others are expected; the same ones are alike to 1.
+_ALIKE = 0.7
+# A way along the line of sight, but for a deviation of a fifth: another size looks like that.
+_ALONG = 1.2
 
 
-def stale_landmarks(cloud: Correspondences, gone: BoolArray) -> str:
-    """Name the points that are gone from a map in a sentence; empty if there are none."""
+def stale_landmarks(
+    cloud: Correspondences, gone: BoolArray, found: Estimate, camera: Camera,
+    names: Sequence[str] = (),
+) -> str:  # fmt: skip
+    """Name the points that are gone from a map in a sentence; empty if there are none.
+
+    Markers, of which four ids in a row are the corners, are also said to lie where the frame shows
+    them.
+
+    Args:
+        found: of the frame.
+        names: of ids; none: they are their own.
+    """
     if not gone.any():
         return ""
-    count, listed = _names(cloud, gone)
-    return f"{count} landmarks in view are often seen and never matched: {listed}"
+    count, listed = _names(cloud, gone, names)
+    said = f"{count} landmarks in view are often seen and never matched: {listed}"
+    ids = ids_of(cloud)
+    if ids is None:
+        return said
+    order = np.argsort(ids, kind="stable")
+    first = [k for k in range(len(ids) - 3) if _is_marker(ids[order[k : k + 4]])]
+    markers = {_name(ids[order[k]], names): order[k : k + 4] for k in first}
+    places = {name: cloud.points[rows].mean(axis=0) for name, rows in markers.items()}
+    for name, rows in markers.items():
+        if np.count_nonzero(gone[rows]) >= _OF_MARKER:
+            said += _elsewhere(name, cloud.points[rows], cloud.pixels[rows], places, found, camera)
+    return said
 
 
-def moved_landmarks(cloud: Correspondences, part: MovedPart | None) -> str:
+def _is_marker(ids: IntArray) -> bool:
+    return ids[0] % 4 == 0 and bool(np.all(np.diff(ids) == 1))
+
+
+def _name(corner: int, names: Sequence[str]) -> str:
+    return names[corner] if names else f"the marker {corner} to {corner + 3}"
+
+
+def _elsewhere(
+    name: str, corners: Array, pixels: Array, places: dict[str, Array], found: Estimate,
+    camera: Camera,
+) -> str:  # fmt: skip
+    """Say where a marker is of which the map has other corners (4,3), by its pixels (4,2).
+
+    It is so small that its image is an affine one, of which the longest axis is not foreshortened:
+    its distance is known but for its size, which the map has.
+    """
+    rotations, translations = found.at_rows(camera.row_time(pixels))
+    centre = -np.einsum("nji,nj->ni", rotations, translations).mean(axis=0)
+    away = np.einsum("nji,nj->ni", rotations, camera.bearings(pixels))
+    axis = away.mean(axis=0)
+    seen, mapped = (each / (each @ axis)[:, None] for each in (away, corners - centre))
+    shape, across = corners - places[name], seen - seen.mean(axis=0)
+    image_of_shape = np.linalg.lstsq(shape, across, _FLAT)[0]
+    place = centre + seen.mean(axis=0) / np.linalg.norm(image_of_shape, 2)
+    way, side = float(np.linalg.norm(place - places[name])), float(np.linalg.norm(shape[0]))
+    expected = mapped - mapped.mean(axis=0)
+    alike = np.sum(across * expected) / (np.linalg.norm(across) * np.linalg.norm(expected))
+    if way < side and alike < _ALIKE:
+        return f"; {name} is turned there, or its corners come in another order"
+    x, y, z = place
+    said = f"; {name} lies near ({x:.2f}, {y:.2f}, {z:.2f}), {way:.2g} m from there"
+    other = min(places, key=lambda each: float(np.linalg.norm(places[each] - place)))
+    if other != name and np.linalg.norm(places[other] - place) < side:
+        return f"{said}, where the map has {other}"
+    near, far = (float(np.linalg.norm(each - centre)) for each in (place, places[name]))
+    if way < _ALONG * abs(near - far):
+        said += f", or measures {far / near:.2g} times what the map says"
+    return said
+
+
+def moved_landmarks(
+    cloud: Correspondences, part: MovedPart | None, names: Sequence[str] = ()
+) -> str:
     """Name the points of a part of the map that was moved; empty if none is in view."""
     if part is None:
         return ""
@@ -85,7 +162,7 @@ def moved_landmarks(cloud: Correspondences, part: MovedPart | None) -> str:
     moved = np.array([tuple(point) in own for point in cloud.points.tolist()], np.bool_)
     if not moved.any():
         return ""
-    count, listed = _names(cloud, moved)
+    count, listed = _names(cloud, moved, names)
     way = 1e3 * float(np.linalg.norm(part.way))
     return (
         f"{count} landmarks in view lie together {way:.2g} mm from where the map has them, seen "
@@ -93,13 +170,13 @@ def moved_landmarks(cloud: Correspondences, part: MovedPart | None) -> str:
     )
 
 
-def _names(cloud: Correspondences, some: BoolArray) -> tuple[int, str]:
+def _names(cloud: Correspondences, some: BoolArray, names: Sequence[str]) -> tuple[int, str]:
     """Return how many landmarks some points are, and the first of their names."""
-    rows = np.flatnonzero(some)
-    if "id" in (cloud.table.dtype.names or ()):
-        names = [str(name) for name in np.unique(cloud.table["id"][rows])]
+    rows, ids = np.flatnonzero(some), ids_of(cloud)
+    if ids is None:
+        points = np.unique(cloud.points[rows], axis=0)
+        own = [f"({x:.2f}, {y:.2f}, {z:.2f})" for x, y, z in points]
     else:
-        names = [
-            f"({x:.2f}, {y:.2f}, {z:.2f})" for x, y, z in np.unique(cloud.points[rows], axis=0)
-        ]
-    return len(names), ", ".join(names[:_NAMED]) + (" ..." if len(names) > _NAMED else "")
+        of = np.unique(ids[rows]).tolist()
+        own = list(dict.fromkeys(names[each] if names else str(each) for each in of))
+    return len(own), ", ".join(own[:_NAMED]) + (" ..." if len(own) > _NAMED else "")

@@ -2,9 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is odd about a frame is said, and what is usual is not."""
 
+import re
+
 import numpy as np
 import pytest
 
+from benchmarks import kinds
 from rs_localizer.core.camera import Camera, Roi
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.pipeline.cloud_checks import oddities, stale_landmarks
@@ -47,11 +50,54 @@ def test_coarse_coordinates_and_pixels_of_another_resolution_are_told(odd, told,
 
 def test_landmarks_that_are_gone_are_named():
     both, none = np.ones(2, np.bool_), np.zeros(2, np.bool_)
-    assert stale_landmarks(cloud(), none) == ""
-    assert stale_landmarks(cloud(), both).endswith(": (0.00, 1.00, 2.00), (1.00, -5.00, 3.00)")
+
+    def said(seen: Correspondences, gone: np.ndarray, names: tuple[str, ...] = ()) -> str:
+        return stale_landmarks(seen, gone, None, CAMERA, names)  # no marker is asked for its place
+
+    assert said(cloud(), none) == ""
+    assert said(cloud(), both).endswith(": (0.00, 1.00, 2.00), (1.00, -5.00, 3.00)")
     table = np.zeros(40, [("id", "<u4")])
     table["id"] = np.arange(40) // 4  # corners of markers
     seen = Correspondences(0, "map", np.zeros((40, 3)), np.zeros((40, 2)), None, 0, table)
-    assert stale_landmarks(seen, table["id"] > 7).endswith("matched: 8, 9")
-    seen.table["id"] = np.arange(40)
-    assert stale_landmarks(seen, np.ones(40, np.bool_)).endswith(" 10, 11 ...")
+    assert said(seen, table["id"] > 7).endswith("matched: 8, 9")
+    assert said(seen, table["id"] > 7, tuple("abcdefghij")).endswith("matched: i, j")
+    seen.table["id"] = 2 * np.arange(40)
+    assert said(seen, np.ones(40, np.bool_)).endswith(" 20, 22 ...")
+
+
+def swapped(corners: np.ndarray) -> None:
+    corners[[7, 10]] = corners[[10, 7]]
+
+
+def moved(corners: np.ndarray) -> None:
+    corners[7] += [0.0, 0.2, 0.1]
+
+
+def larger(corners: np.ndarray) -> None:
+    corners[7] += corners[7] - corners[7].mean(axis=0)
+
+
+def turned(corners: np.ndarray) -> None:
+    corners[7] = np.roll(corners[7], 1, axis=0)
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        (swapped, "m from there, where the map has the marker 40 to 43"),
+        (moved, r"0\.2[123]? m from there"),
+        (larger, r"or measures 0\.(49|5|51) times what the map says"),
+        (turned, "the marker 28 to 31 is turned there"),
+    ],
+)
+def test_markers_that_are_elsewhere_are_said_to_lie_there(fault, said):
+    """Markers of 20 cm on a wall 2 m away, by 0.3 px."""
+
+    def told(seen: kinds.Seen, rng: np.random.Generator) -> kinds.Seen:
+        corners = seen.points.reshape(-1, 4, 3).copy()
+        fault(corners)
+        return seen._replace(points=corners.reshape(-1, 3))
+
+    kind = kinds.Kind("markers elsewhere", kinds._wall, told, noise=0.3)
+    texts = kinds.judged(kind, 1, 1, 25).texts
+    assert re.search(said, texts["stale_landmarks"]), texts
