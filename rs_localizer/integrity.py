@@ -22,9 +22,10 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.config import Acceleration
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
+from rs_localizer.core.arrays import Array, Array2, BoolArray
 from rs_localizer.core.state import POSE, TURN
 from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.moved_part import likeness
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.estimation.window import acceleration_covariance
 from rs_localizer.native import entry
@@ -216,36 +217,3 @@ def _transitions(innovation: float) -> Array:
         [goes, 1.0 - RECOVERS, goes],
         [stays * jump, 0.0, stays * (1.0 - jump) - RETURNS],
     ])  # fmt: skip
-
-
-def likeness(points: Array, numbers: Array, neighbours: int) -> float:
-    """Return the mean product of numbers (n,) of points (n,3) and of their neighbours."""
-    widest = int(np.ptp(points, axis=0).argmax())
-    order = points[:, widest].argsort()
-    found: float = _likeness(points[order], numbers[order], neighbours, widest)
-    return found
-
-
-@entry
-def _likeness(points: Array2, numbers: Array1, neighbours: int, sorted_by: int) -> float:
-    count, total = len(points), 0.0
-    far, near = np.empty(neighbours), np.empty(neighbours)
-    for i in range(count):
-        far[:] = np.inf
-        for step in (-1, 1):  # both ways, until all others are farther along that axis alone
-            j = i + step
-            while 0 <= j < count:
-                if not (points[i, sorted_by] - points[j, sorted_by]) ** 2 < far[neighbours - 1]:
-                    break
-                square = 0.0
-                for axis in range(3):
-                    square += (points[i, axis] - points[j, axis]) ** 2
-                if square < far[neighbours - 1]:
-                    place = neighbours - 1
-                    while place > 0 and square < far[place - 1]:
-                        far[place], near[place] = far[place - 1], near[place - 1]
-                        place -= 1
-                    far[place], near[place] = square, numbers[j]
-                j += step
-        total += numbers[i] * near.sum()
-    return total / (count * neighbours)

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOVE, PARAMETERS, rotation_of
 from rs_localizer.estimation.hypotheses import Posterior
@@ -31,6 +31,7 @@ from rs_localizer.estimation.prior import PriorTerms
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.robust import LEAST_NOISE, TINY, WIDEST_GATE
 from rs_localizer.estimation.search import GLOBAL_SHUTTER_SCALE
+from rs_localizer.native import entry
 
 # Frames that are compared, and after how many others at most.
 _LOOKS, _RARELY = 4, 60
@@ -178,15 +179,43 @@ def neighbours_alike(observed: Observed, posterior: Posterior) -> bool:
     count = len(near)
     if count <= 2 * _NEIGHBOURS:
         return False
-    off = errors[near] - errors[near].mean(axis=0)
-    places = observed.observations.points[near]
-    squares = np.sum(places**2, axis=1)
-    far = squares - 2.0 * places @ places.T  # but for a part that is a point's own
-    far[np.diag_indices(count)] = np.inf
-    beside = np.argpartition(far, _NEIGHBOURS, axis=1)[:, :_NEIGHBOURS]
-    products = np.einsum("na,nka->", off, off[beside]) / _NEIGHBOURS
-    index = float(products) / max(float(np.sum(off**2)), TINY)
+    off, places = errors[near] - errors[near].mean(axis=0), observed.observations.points[near]
+    products = sum(likeness(places, each, _NEIGHBOURS) for each in off.T)
+    index = count * products / max(float(np.sum(off**2)), TINY)
     return index + 1.0 / count > _ALIKE / math.sqrt(2.0 * count * _NEIGHBOURS / 1.5)
+
+
+def likeness(points: Array, numbers: Array, neighbours: int) -> float:
+    """Return the mean product of numbers (n,) of points (n,3) and of their neighbours."""
+    widest = int(np.ptp(points, axis=0).argmax())
+    order = points[:, widest].argsort()
+    found: float = _likeness(points[order], numbers[order], neighbours, widest)
+    return found
+
+
+@entry
+def _likeness(points: Array2, numbers: Array1, neighbours: int, sorted_by: int) -> float:
+    count, total = len(points), 0.0
+    far, near = np.empty(neighbours), np.empty(neighbours)
+    for i in range(count):
+        far[:] = np.inf
+        for step in (-1, 1):  # both ways, until all others are farther along that axis alone
+            j = i + step
+            while 0 <= j < count:
+                if not (points[i, sorted_by] - points[j, sorted_by]) ** 2 < far[neighbours - 1]:
+                    break
+                square = 0.0
+                for axis in range(3):
+                    square += (points[i, axis] - points[j, axis]) ** 2
+                if square < far[neighbours - 1]:
+                    place = neighbours - 1
+                    while place > 0 and square < far[place - 1]:
+                        far[place], near[place] = far[place - 1], near[place - 1]
+                        place -= 1
+                    far[place], near[place] = square, numbers[j]
+                j += step
+        total += numbers[i] * near.sum()
+    return total / (count * neighbours)
 
 
 def _near(observed: Observed, errors: Array) -> BoolArray:
