@@ -2,7 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Oddities of correspondences that a reader of clouds cannot see, and that refuse no frame."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -73,8 +76,8 @@ def oddities(
 _NAMED = 12
 # So many corners of a marker that is elsewhere are never matched; others may be, by chance.
 _OF_MARKER = 2
-# Corners lie in a plane: what is out of it by such a share is rounding.
-_FLAT = 1e-3
+# Corners are those of a square: what is out of it by such a share is rounding, or no marker.
+_FLAT, _ROUND = 0.01, np.array([1.0, -1.0, 1.0, -1.0])
 # Corners that are seen where others are expected; the same ones are alike to 1.
 _ALIKE = 0.7
 # A way along the line of sight, but for a deviation of a fifth: another size looks like that.
@@ -98,57 +101,65 @@ def stale_landmarks(
         return ""
     count, listed = _names(cloud, gone, names)
     said = f"{count} landmarks in view are often seen and never matched: {listed}"
-    ids = ids_of(cloud)
-    if ids is None:
-        return said
-    order = np.argsort(ids, kind="stable")
-    first = [k for k in range(len(ids) - 3) if _is_marker(ids[order[k : k + 4]])]
-    markers = {_name(ids[order[k]], names): order[k : k + 4] for k in first}
-    places = {name: cloud.points[rows].mean(axis=0) for name, rows in markers.items()}
-    for name, rows in markers.items():
-        if np.count_nonzero(gone[rows]) >= _OF_MARKER:
-            said += _elsewhere(name, cloud.points[rows], cloud.pixels[rows], places, found, camera)
+    markers = _Markers.of(cloud, names)
+    for k in np.flatnonzero(gone[markers.rows].sum(axis=1) >= _OF_MARKER).tolist():
+        said += f"; {markers.names[k]} {_elsewhere(k, markers, cloud, found, camera)}"
     return said
 
 
-def _is_marker(ids: IntArray) -> bool:
-    return ids[0] % 4 == 0 and bool(np.all(np.diff(ids) == 1))
+class _Markers(NamedTuple):
+    """The markers of a cloud: squares of which four ids in a row are the corners."""
 
+    rows: IntArray  # (m,4) of corners in the cloud
+    centres: Array  # (m,3) as the map has them
+    names: list[str]
 
-def _name(corner: int, names: Sequence[str]) -> str:
-    return names[corner] if names else f"the marker {corner} to {corner + 3}"
+    @classmethod
+    def of(cls, cloud: Correspondences, names: Sequence[str]) -> _Markers:
+        own = ids_of(cloud)
+        ids, rows = np.unique(np.zeros(0, np.int64) if own is None else own, return_index=True)
+        first = np.flatnonzero((ids[:-3] % 4 == 0) & (ids[3:] == ids[:-3] + 3))
+        rows = rows[first[:, None] + np.arange(4)]
+        points = cloud.points[rows]
+        out = np.linalg.norm(np.einsum("mki,k->mi", points, _ROUND), axis=1)
+        square = out < _FLAT * np.linalg.norm(points[:, 1] - points[:, 0], axis=1)
+        called = [
+            names[corner] if names else f"the marker {corner} to {corner + 3}"
+            for corner in ids[first[square]].tolist()
+        ]
+        return cls(rows[square], points[square].mean(axis=1), called)
 
 
 def _elsewhere(
-    name: str, corners: Array, pixels: Array, places: dict[str, Array], found: Estimate,
-    camera: Camera,
-) -> str:  # fmt: skip
-    """Say where a marker is of which the map has other corners (4,3), by its pixels (4,2).
+    marker: int, markers: _Markers, cloud: Correspondences, found: Estimate, camera: Camera
+) -> str:
+    """Say where a marker is of which the map has other corners.
 
     It is so small that its image is an affine one, of which the longest axis is not foreshortened:
     its distance is known but for its size, which the map has.
     """
+    rows, centres = markers.rows[marker], markers.centres
+    corners, pixels = cloud.points[rows], cloud.pixels[rows]
     rotations, translations = found.at_rows(camera.row_time(pixels))
-    centre = -np.einsum("nji,nj->ni", rotations, translations).mean(axis=0)
+    eye = -np.einsum("nji,nj->ni", rotations, translations).mean(axis=0)
     away = np.einsum("nji,nj->ni", rotations, camera.bearings(pixels))
-    axis = away.mean(axis=0)
-    seen, mapped = (each / (each @ axis)[:, None] for each in (away, corners - centre))
-    shape, across = corners - places[name], seen - seen.mean(axis=0)
-    image_of_shape = np.linalg.lstsq(shape, across, _FLAT)[0]
-    place = centre + seen.mean(axis=0) / np.linalg.norm(image_of_shape, 2)
-    way, side = float(np.linalg.norm(place - places[name])), float(np.linalg.norm(shape[0]))
-    expected = mapped - mapped.mean(axis=0)
+    shape, axis = corners - centres[marker], away.mean(axis=0)
+    seen, expected = (each / (each @ axis)[:, None] for each in (away, corners - eye))
+    middle = seen.mean(axis=0)
+    across, expected = seen - middle, expected - expected.mean(axis=0)
+    place = eye + middle / np.linalg.norm(np.linalg.lstsq(shape, across, _FLAT)[0], 2)
+    far, side = np.linalg.norm(centres - place, axis=1), np.linalg.norm(shape[0])
+    way, nearest = float(far[marker]), int(np.argmin(far))
     alike = np.sum(across * expected) / (np.linalg.norm(across) * np.linalg.norm(expected))
     if way < side and alike < _ALIKE:
-        return f"; {name} is turned there, or its corners come in another order"
+        return "is turned there, or its corners come in another order"
     x, y, z = place
-    said = f"; {name} lies near ({x:.2f}, {y:.2f}, {z:.2f}), {way:.2g} m from there"
-    other = min(places, key=lambda each: float(np.linalg.norm(places[each] - place)))
-    if other != name and np.linalg.norm(places[other] - place) < side:
-        return f"{said}, where the map has {other}"
-    near, far = (float(np.linalg.norm(each - centre)) for each in (place, places[name]))
-    if way < _ALONG * abs(near - far):
-        said += f", or measures {far / near:.2g} times what the map says"
+    said = f"lies near ({x:.2f}, {y:.2f}, {z:.2f}), {way:.2g} m from there"
+    if nearest != marker and far[nearest] < side:
+        return f"{said}, where the map has {markers.names[nearest]}"
+    seen_at, mapped = (float(np.linalg.norm(each - eye)) for each in (place, centres[marker]))
+    if way < _ALONG * abs(seen_at - mapped):
+        said += f", or measures {mapped / seen_at:.2g} times what the map says"
     return said
 
 
