@@ -352,7 +352,7 @@ class Localizer:
                 local = np.einsum("nij,nj->ni", at_rows[0], landmarks[own]) + at_rows[1]
                 shown[own] = seen_at(exposure.cameras[place], local @ axes.T + moved)
             first += count
-        errors: Array = np.linalg.norm(shown - seen, axis=1)
+        errors: Array = np.hypot(*(shown - seen).T)
         return errors
 
     def known_of(
