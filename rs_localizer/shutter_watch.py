@@ -148,6 +148,7 @@ class _Way(NamedTuple):
     speed: Array  # (6,) rad and units, per s
     change: Array  # (6,) and per s^2
     by_stamps: Array  # (3,6) the speed's, by errors of the three stamps
+    noise: float  # of the speed, squared
 
     @classmethod
     def through(cls, before: _Look, now: _Look, after: _Look) -> _Way | None:
@@ -174,7 +175,9 @@ class _Way(NamedTuple):
             -slopes[0].sum() * speed - change,
             slopes[0, 1] * (speed + times[1] * change),
         ])  # fmt: skip
-        return cls(float(times[1] - times[0]), speed, change, by_stamps)
+        seconds = float(times[1] - times[0])
+        unsure = float(np.sum(noise.diagonal() / now.units**2)) / seconds**2
+        return cls(seconds, speed, change, by_stamps, unsure)
 
 
 class ShutterWatch:
@@ -212,6 +215,7 @@ class ShutterWatch:
         self._reversed = False  # they may run the other way
         self._across = False  # or along the other axis
         self._looks: deque[_Look] = deque(maxlen=3)
+        self._seen: _Look | None = None  # the newest, also if it is too close to be compared
         self._rotations, self._frames = RowRotations(), 0
         # Squared speeds, and squared differences of speeds half an interval before and after
         self._speeds = np.zeros(2)
@@ -244,8 +248,8 @@ class ShutterWatch:
         if not (self._reversed or self._across):
             return found
         steps = [np.r_[np.zeros(6), -2.0 * own]]
-        if self._across:
-            sideways = self._looks[-1].over_columns()
+        if self._across and self._seen is not None and self._seen.found.rotation is found.rotation:
+            sideways = self._seen.over_columns()
             steps = [sideways * np.repeat([1.0, sign], 6) for sign in (1.0, -1.0)]
             for step in steps:
                 step[VELOCITIES] -= own
@@ -268,11 +272,15 @@ class ShutterWatch:
             return
         if jumped or (self._looks and time_ns <= self._looks[-1].time_ns):
             self._looks.clear()
-        if self._looks and time_ns - self._looks[-1].time_ns < 1e9 * _CLOSEST:
+        is_close = bool(self._looks) and time_ns - self._looks[-1].time_ns < 1e9 * _CLOSEST
+        if is_close and not self._across:
             return
         some = slice(None, None, 1 + len(points) // _MOST_POINTS)
         points, pixels = map(np.ascontiguousarray, (points[some], pixels[some]))
-        self._looks.append(self._look(time_ns, found, points, pixels))
+        self._seen = self._look(time_ns, found, points, pixels)
+        if is_close:
+            return
+        self._looks.append(self._seen)
         # The first of the stamps goes, and the next is as uncertain as any.
         newer = [*range(_STAMPS.start), *range(_STAMPS.start + 1, _ESTIMATED), _STAMPS.start]
         self._mean, self._covariance = self._mean[newer], self._covariance[np.ix_(newer, newer)]
@@ -317,8 +325,10 @@ class ShutterWatch:
 
     def _measure(self, now: _Look, way: _Way) -> None:
         """Add the evidence of a frame."""
-        changes = 0.25 * way.seconds**2 * way.change @ way.change
-        self._speeds = _MEMORY * self._speeds + [way.speed @ way.speed, changes]
+        # The noise of poses is in both, as if the camera shook: what it makes is taken off.
+        changes = 0.25 * way.seconds**2 * way.change @ way.change - 12.0 * way.noise
+        speeds = way.speed @ way.speed - way.noise
+        self._speeds = _MEMORY * self._speeds + [speeds, changes]
         lasting = np.repeat([math.sqrt(1.0 / _MEMORY), _ALIKE, 1.0], [2, 12, 3])
         spread = float(self._covariance[_TIMES, _TIMES].diagonal().max())
         lasting[_TIMES] = np.minimum(lasting[_TIMES], math.sqrt(self._any[0, 0] / spread))
@@ -359,7 +369,7 @@ class ShutterWatch:
 
         A hand's 1.5 Hz at ten images per second has 14 %.
         """
-        speeds, changes = self._speeds
+        speeds, changes = np.maximum(self._speeds, 0.0)
         return float(changes / (6.0 * speeds)) if speeds else 0.0
 
     @property

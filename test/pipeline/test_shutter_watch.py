@@ -379,6 +379,21 @@ def test_a_camera_that_shakes_between_its_frames_is_not_contradicted(amplitude, 
         assert tracker.shutter.fault == ""
 
 
+def test_a_frame_is_widened_by_what_it_shows_itself_of_the_other_axis():
+    """Also if it comes 10 ms after the last one that was compared."""
+    localizer, widened = Localizer(CAMERA), []
+    seen = frames_with_truth("left_to_right", 2, rate=100.0)
+    clouds = [read_correspondences(message) for message, _ in seen]
+    for given in (clouds, clouds[1:]):
+        watch = ShutterWatch(CAMERA, 2.0)
+        watch._across = True  # likely, by the frames before
+        for cloud in given:
+            found = localizer.localize(cloud.points, cloud.pixels)
+            watch.add(cloud.stamp_ns, found, cloud.points, cloud.pixels)
+        widened.append(watch.widened(found).joint_covariance)
+    np.testing.assert_array_equal(*widened)
+
+
 def test_a_real_camera_told_the_other_axis_is_refused():
     frames = CameraFrames(NodeConfig(readout_time=0.0129, scan_direction="left_to_right"))
     with open_bag(data.path(data.WEBCAM)) as bag:
