@@ -64,8 +64,9 @@ from rs_localizer.solvers.table import find_solver
 
 # After a longer gap (s) a prediction helps less than a fresh search.
 _LONGEST_GAP = 1.0
-# If this many frames in a row are closer than a microsecond, times are seconds or milliseconds.
-_LEAST_STEP_NS, _MOST_TOO_CLOSE = 1000, 3
+# If this many frames in a row are this close, times are in another unit: ten images per second are
+# 100,000 microseconds apart.
+_LEAST_STEP_NS, _MOST_TOO_CLOSE = 100_001, 10
 # No video has a nanosecond count below this; these are seconds and milliseconds of the years 2001
 # to 2096.
 _COUNTED, _SINCE_1970 = 1_000_000, ((10**9, 4 * 10**9), (10**12, 4 * 10**12))
@@ -261,8 +262,8 @@ class Tracker:
         coarse = time_ns < _COUNTED or any(low <= time_ns < high for low, high in _SINCE_1970)
         if self._too_close >= (1 if coarse else _MOST_TOO_CLOSE):
             raise ValueError(
-                f"frames are {step} ns apart: time_ns is in nanoseconds, 1e9 of a second and 1e6 "
-                "of a millisecond"
+                f"frames are {step} ns apart: time_ns is in nanoseconds, 1e9 of a second, 1e6 of "
+                "a millisecond and 1e3 of a microsecond"
             )
 
     def expect(self, time_ns: int, prior: Prior) -> None:

@@ -371,16 +371,22 @@ def test_with_a_readout_time_far_off_each_image_speaks_for_itself():
     assert by_doubt < 1.05 * alone
 
 
-# Of whole seconds, of milliseconds at 30 Hz, and by a clock that began at 0.
-@pytest.mark.parametrize("stamps", [(1_700_000_000, 1_700_000_001), (1.7e12, 1.7e12 + 33), (0, 33)])
-def test_times_in_other_units_are_refused(stamps):
+# Of whole seconds, of milliseconds at 30 Hz, by a clock that began at 0, and of microseconds, which
+# may be nanoseconds since the camera was switched on.
+@pytest.mark.parametrize(
+    ("stamps", "pairs"),
+    [((1_700_000_000, 1_700_000_001), 1), ((1.7e12, 1.7e12 + 33), 1), ((0, 33), 1),
+     ((1.7e15, 1.7e15 + 33_333), 10)],
+)  # fmt: skip
+def test_times_in_other_units_are_refused(stamps, pairs):
     tracker, (first, second) = Tracker(rsl.Localizer(CAMERA)), map(int, stamps)
     points, pixels = Hand().frame(0.0, 40)
     with pytest.raises(ValueError, match=r"a whole number of nanoseconds, got 12\.5"):
         tracker.localize(12.5, points, pixels)
-    assert tracker.localize(first, points, pixels)
+    for k in range(pairs):
+        assert tracker.localize(first + k * (second - first), points, pixels)
     with pytest.raises(ValueError, match=f"frames are {second - first} ns apart: time_ns is in na"):
-        tracker.localize(second, points, pixels)
+        tracker.localize(first + pairs * (second - first), points, pixels)
 
 
 def test_after_a_third_of_a_second_without_the_board_no_pose_jumps():
