@@ -75,8 +75,8 @@ _NEWEST = 0.3
 # Largest squared distance of a searched motion from the track: once in a million by chance.
 _MOST_INNOVATION = 62.0
 # Of the logarithm of the odds of a vibration, the part that the next frame has of it: sizes and
-# spectra last for ten frames.
-_REMEMBERED = 0.9
+# spectra last for thirty frames, in which a motor is seen that no frame shows.
+_REMEMBERED = 0.97
 # How fast a camera may be that a track begins with, in configured deviations: who hardly turns is
 # taken for slow by one image, and may be a car.
 _FAST = 2.0

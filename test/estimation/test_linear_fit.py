@@ -135,17 +135,25 @@ def test_vibration_is_integrated_as_over_dense_matrices():
     freedom, noise = 62.0, 0.5
     white = dense.T @ dense / noise**2 + information
     first = -np.linalg.solve(white, dense.T @ errors / noise**2 + slope)
-    fast = np.exp(-0.5 * (np.log(CYCLES / 5.0) / 0.4) ** 2) + 0.03
-    fast *= np.sqrt(np.sum(TYPICAL_SIZES**2) / np.sum(fast**2))
-    every = [factor * np.repeat(of, 2) for of in (TYPICAL_SIZES, fast) for factor in FACTORS]
-    prior = np.tile(-0.5 * (np.log(FACTORS) / np.log(10.0)) ** 2, 2)
+    bands = np.array([1.3, 3.3, 1.0, 2.0, 3.0, 5.0])[:, None]
+    near = np.exp(-0.5 * (np.log(CYCLES / bands) / 0.35) ** 2) + 0.1
+    near *= np.sqrt(np.sum(TYPICAL_SIZES**2) / np.sum(near**2, axis=1, keepdims=True))
+    axes = [np.array([0.1, 0.1, 1.0])] * 2 + [np.ones(3)] * 5  # the first: about the optical axis
+    shapes = zip((*near, TYPICAL_SIZES), axes, strict=True)
+    every = [
+        factor * np.outer(np.repeat(of, 2), axis).ravel()
+        for of, axis in shapes
+        for factor in FACTORS
+    ]
+    prior = np.tile(-0.5 * (np.log(FACTORS) / np.log(10.0)) ** 2, 7)
+    prior[: 2 * len(FACTORS)] -= 4.0
     prior -= logsumexp(prior)
     rest = noise**2 * (
         errors @ errors / noise**2 + prior_cost
         + first @ (dense.T @ errors / noise**2 + slope)
     )  # fmt: skip
     for sizes, before in zip(every, prior, strict=True):
-        columns = turns * np.repeat(sizes, 3)
+        columns = turns * sizes
         beside = columns.T @ columns / noise**2
         across = np.linalg.solve(white, dense.T @ columns) / noise**2
         beside -= columns.T @ dense / noise**2 @ across
@@ -154,7 +162,7 @@ def test_vibration_is_integrated_as_over_dense_matrices():
         explained = noise**2 * along @ inner @ along
         left = 1.0 - explained / rest
         logs.append(before + 0.5 * np.linalg.slogdet(inner)[1] - 0.5 * freedom * np.log(left))
-        pull = middle * np.repeat(sizes, 3) - across
+        pull = middle * sizes - across
         mean = -inner @ along
         second = rest * left / freedom / noise**2 * inner + np.outer(mean, mean)
         moments.append(pull @ second @ pull.T)
