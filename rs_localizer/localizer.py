@@ -39,7 +39,7 @@ from rs_localizer.estimation.calibration import (
 )
 from rs_localizer.estimation.hypotheses import Posterior, frame_posterior
 from rs_localizer.estimation.known_rotation import coupled_turn
-from rs_localizer.estimation.left_out import LeftOut, left_out
+from rs_localizer.estimation.left_out import LeftOut, by_chance, left_out
 from rs_localizer.estimation.moved_part import MovedParts, look_at, neighbours_alike
 from rs_localizer.estimation.points import (
     NEAREST,
@@ -79,6 +79,8 @@ _LOOKS = 2
 _STILL_TRACKED = 0.7
 # If noise fills a gate, it is widened up to this many times, by at least this factor at a time.
 _WIDEST, _LEAST_WIDER = 4.0, 1.25
+# Noise is half-normal, of this part of the gate: users leave room for errors of 3.5 deviations.
+_NOISE = 0.25
 
 
 class _Inputs(NamedTuple):
@@ -378,20 +380,29 @@ class Localizer:
         if observed.rotation is not None:
             in_frame = coupled_turn(observed.rotation, terms is not observed.terms)
         one_lens = observed.exposure.alone
-        assumed = replace(observed.assumed, may_rest=may_rest, one_lens=one_lens, in_frame=in_frame)
+        assumed = replace(
+            observed.assumed, may_rest=may_rest, one_lens=one_lens, in_frame=in_frame,
+            noise=_NOISE * gate,
+        )  # fmt: skip
         observations = observed.observations
         if not self._full:
             seen = observations.packed, observations.count
             return Posterior(*best_motion(*seen, best.state, terms, gate))._replace(gate=gate)
-        most = _WIDEST * gate
+        threshold, most, rolling = gate, _WIDEST * gate, self._solver.rolling_shutter
+        searched = terms is observed.terms and rolling
         while True:
             posterior = frame_posterior(observations, best.state, terms, gate, assumed)
             posterior = posterior._replace(gate=gate)
+            if gate >= most:
+                return posterior
             # A map whose points are off by more than anybody said has more noise than a gate lets
             # through: as long as the noise fills it, nobody knows how much.
-            if gate >= most or not noise_fills(posterior, self._solver.rolling_shutter):
+            if noise_fills(posterior, rolling):
+                gate = min(max(GATE / WIDEST_GATE * posterior.noise, _LEAST_WIDER * gate), most)
+            elif searched and by_chance(observed, posterior, threshold) is not None:
+                gate = most  # some of few points that vibrate fit a motion without vibration
+            else:
                 return posterior
-            gate = min(max(GATE / WIDEST_GATE * posterior.noise, _LEAST_WIDER * gate), most)
 
     def _gate(self, observed: Observed, state: Array) -> float:
         """Return the inlier threshold (px), widened by the declared deviation of the map."""

@@ -76,7 +76,8 @@ SWITCHES: dict[str, tuple[Switch, ...]] = {
     "another-matrix": (
         Switch("rs_localizer.estimation.left_out:_of_another_lens", _always(None)),
     ),
-    "by-chance": (Switch("rs_localizer.estimation.left_out:_by_chance", _always(None)),),
+    "by-chance": tuple(Switch(f"rs_localizer.{at}:by_chance", _always(None))
+                       for at in ("localizer", "estimation.left_out")),
     "left-out": (Switch("rs_localizer.localizer:left_out", _always(LeftOut())),),
     # Tracking.
     "window": (Switch("rs_localizer.estimation.window:LENGTH", lambda old: 2),),

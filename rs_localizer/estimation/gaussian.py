@@ -275,7 +275,8 @@ def over_leans(frame: Frame, mode: Mode, terms: PriorTerms) -> Mode:
     held = Frame(
         frame.data, frame.points, frame.chosen,
         Shared(shared.rows, shared.squares, np.array([mode.size]), np.zeros(1)),
-        Noise(mode.noise, noise.correction, noise.decided), frame.focal_length, frame.depth,
+        Noise(mode.noise, noise.correction, noise.decided, noise.expected),
+        frame.focal_length, frame.depth,
     )  # fmt: skip
     parts, whole = _leans(held, mode, terms)
     if not (len(parts.states) and np.isfinite(whole)):

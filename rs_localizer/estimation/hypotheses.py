@@ -325,7 +325,7 @@ def _with_turn(
     motion, known = steady.posterior, known_at(given.terms, given.best.state)
     gain, undetected, vibrations = hidden(
         given.lines, given.best.inliers, given.frame.shared.at(motion.shared), known,
-        motion.noise, motion.freedom, prior,
+        motion.noise, motion.freedom, given.assumed.noise, prior,
     )  # fmt: skip
     gain, posterior = gain + expected, steady.posterior._replace(vibrations=vibrations)
     vibrating = _vibrating(given, hypotheses, posterior, prior) if gain > asks else None
@@ -401,12 +401,13 @@ def _vibrating(
             coupled[:-1, -1] += first
             linear = changed(linear, coupled)
         known, is_last = known_at(given.terms, still), is_last or k == _STEPS - 1
-        decided = float(PARAMETERS)  # by points
+        seen = Noise(noise, 1.0, float(PARAMETERS), given.assumed.noise)
         if in_frame is not None:  # a step that is short would change the noise alone
-            found = fit(linear, shared, known, Noise(noise, 1.0, decided), prior, False)
+            found = fit(linear, shared, known, seen, prior, False)
             noise = max(found.noise, LEAST_NOISE)
+            seen = seen._replace(deviation=noise)
         finely = is_last or in_frame is not None
-        found = fit(linear, shared, known, Noise(noise, 1.0, decided), prior, finely)
+        found = fit(linear, shared, known, seen, prior, finely)
         if in_frame is not None:
             found = of_changed(found, by)
         step = first + found.step

@@ -113,7 +113,7 @@ def left_out(
     rest = ~(posterior.squared_errors < (_ELSEWHERE * WIDEST_GATE * posterior.gate) ** 2)
     found, left = int(np.count_nonzero(inliers)), int(np.count_nonzero(rest))
     wide = posterior.gate > _WIDE * threshold  # for noise, or for what another matrix explains
-    failure = None if known else _by_chance(observed, posterior, wide)
+    failure = None if known else by_chance(observed, posterior, threshold)
     if failure is not None:
         return LeftOut(failure, _rough(observed, posterior) if wide else "")
     # A principal point alone may point to another image.
@@ -368,24 +368,29 @@ def _surprise(total: int, size: int, sample: int, chance: float) -> float:
     return -(choices(total, size) + choices(size, sample) + (size - sample) * math.log(chance))
 
 
-def _by_chance(observed: Observed, posterior: Posterior, wide: bool) -> Failure | None:
-    """Return the failure of a motion that fits no more near points than chance makes fit.
+def by_chance(observed: Observed, posterior: Posterior, threshold: float) -> Failure | None:
+    """Return the failure of a motion that fits no more points than chance makes fit.
 
-    Other mismatches lie anywhere; these may be a camera's that vibrates, or those of a rough map.
+    Points near their places may be those of a camera that vibrates, or of a rough map: they fit by
+    chance unless a motion is surprising among them. Where the gate was widened for them, a pose is,
+    among points that lie anywhere.
     """
     errors, inliers = posterior.squared_errors, posterior.inliers
+    found = int(np.count_nonzero(inliers))
+    gate = float(errors[inliers].max(initial=0.0))
     # Of a rough map, or a short focal length, the gate may be as wide: others need room beside it.
-    gate = float(errors[inliers].max())
     circle = max((GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length) ** 2, 4.0 * gate)
-    near, found = int(np.count_nonzero(errors <= circle)), int(np.count_nonzero(inliers))
-    if not wide and near <= found + _MARKER:
+    near = int(np.count_nonzero(errors <= circle))
+    if posterior.gate > _WIDE * threshold:
+        total, sample, area = len(errors), _OF_POSE, _area(observed) / math.pi
+    elif near <= found + _MARKER:
         return None
-    # What fills a gate may be vibration, of which one readout tells as many numbers again.
-    sample = PARAMETERS if wide else PARAMETERS // 2
+    else:
+        total, sample, area = near, PARAMETERS // 2, circle
     # One point may fill the gate, as a near one does of a rough map: so many others fit better.
     best, sizes = np.sort(errors[inliers]), (found, 3 * found // 4, found // 2)
-    surprises = [_surprise(near, k, sample, float(best[k - 1]) / circle) for k in sizes if k]
-    if max(surprises) > _LEAST_CHANCE:
+    surprises = [_surprise(total, k, sample, float(best[k - 1]) / area) for k in sizes if k]
+    if max(surprises, default=0.0) > _LEAST_CHANCE:
         return None
     return Failure(
         Reason.MODEL_ERROR,

@@ -320,6 +320,7 @@ class Noise(NamedTuple):
     deviation: float  # px
     correction: float  # of the mean square, because the gate cuts errors off
     decided: float  # parameters that the points decide
+    expected: float = math.inf  # px, of its half-normal prior; infinite: it may be any
 
 
 class KnownMotion(NamedTuple):
@@ -496,7 +497,8 @@ def _at_size(
         for k in range(m, size):  # columns that the motion mimics wholly explain nothing
             whole[k, k] += _RIDGE * diagonal[k]
         whole[size, size] = max(cost, TINY)
-        turn, own, gain, ratio, weights = _over_turns(whole[m:, m:], freedom, prior, finely)
+        scale = 0.5 * variance / noise.expected**2
+        turn, own, gain, ratio, weights = _over_turns(whole[m:, m:], freedom, prior, scale, finely)
         pulled = -(half.T @ whole[:m, m:size].copy())
         step[:m] += pulled @ turn
         across = pulled @ own
@@ -522,12 +524,13 @@ def _at_size(
 
 @kernel
 def _over_turns(
-    equations: Array, freedom: float, prior: TurnPrior, finely: bool
+    equations: Array, freedom: float, prior: TurnPrior, scale: float, finely: bool
 ) -> tuple[Array, Array, float, float, Array]:
     """Integrate over the prior of the in-frame turn beside the motion.
 
     Args:
         equations: (55,55) of the turn, with the motion taken out; the last ones are the errors'.
+        scale: their noise's variance, over twice that of the prior of noise.
 
     Returns:
         mean (54,) and covariance (54,54); logarithm of the evidence, against none; how much of the
@@ -542,12 +545,13 @@ def _over_turns(
         wholes[0] = equations[:size]
         eliminate(wholes[0], size)
         free, volume = max(1.0 - np.sum(wholes[0, :, size] ** 2) / rest, _LEAST_LEFT), 0.0
+        noisy = scale * rest / freedom  # if there is no turn
         is_hopeless = False
         for k in range(count):
             is_less = k > 0 and prior.odds[k] < prior.odds[k - 1]
             if not is_less:
                 is_hopeless = False  # another spectrum
-            most = prior.odds[k] + volume - 0.5 * freedom * math.log(free)
+            most = prior.odds[k] + volume - 0.5 * freedom * math.log(free) + noisy * (1.0 - free)
             if is_hopeless or (is_less and most < best - _HOPELESS):
                 is_hopeless = True
                 continue
@@ -563,6 +567,7 @@ def _over_turns(
                 volume -= math.log(whole[i, i])
             left[k] = max(1.0 - np.sum(whole[:, size] ** 2) / rest, _LEAST_LEFT)
             weights[k] = prior.odds[k] + volume - 0.5 * freedom * math.log(left[k])
+            weights[k] += noisy * (1.0 - left[k])
             best = max(best, weights[k])
             is_hopeless = is_less and weights[k] < best - _HOPELESS
     if not best > -np.inf:
@@ -648,13 +653,14 @@ def fit(
 @entry
 def hidden(
     lines: Lines, chosen: BoolArray1, shared: Shared, known: KnownMotion, deviation: float,
-    freedom: float, prior: TurnPrior,
+    freedom: float, expected: float, prior: TurnPrior,
 ) -> tuple[float, Array, Array]:  # fmt: skip
     """Return evidence and effect of vibration at the best motion without it.
 
     Args:
         shared: of one size, which is that without vibration.
         deviation, freedom: of the noise (px), likewise.
+        expected: px, see :class:`Noise`.
 
     Returns:
         logarithm of its evidence, against none; (12,12) second moments of the motion by it;
@@ -662,7 +668,7 @@ def hidden(
     """
     place, taken = MOTION_PARAMETERS, taken_by(shared.squares, shared.sizes[0], deviation)
     # The degrees of freedom left are the same as with all sizes of the smooth error.
-    noise = Noise(deviation, 1.0, len(shared.rows) - np.sum(taken) - freedom)
+    noise = Noise(deviation, 1.0, len(shared.rows) - np.sum(taken) - freedom, expected)
     linear = linear_of(lines, chosen, True, shared.rows)
     found = fit(linear, shared, known, noise, prior, True)
     if not found.evidence > -np.inf:

@@ -459,6 +459,7 @@ class Assumed:
     one_lens: bool = True  # of two lenses a smooth error is not one polynomial
     of_rest: float = 0.0  # logarithm of the odds for rest, beside those of any camera
     of_vibration: Array = field(default_factory=np.zeros(0).copy)  # see Prior
+    noise: float = math.inf  # px, of its half-normal prior
     turn: TurnSeen | None = None  # by a rotation prior
     in_frame: CoupledTurn | None = None  # likewise
 

@@ -152,12 +152,18 @@ def test_near_points_of_a_rough_map_do_not_make_the_others_fit_by_chance(seed):
     assert off @ np.linalg.solve(result.covariance[:6, :6], off) < 22.5  # 99.9 %
 
 
-def test_points_that_fit_by_chance_are_no_motion():
-    random = np.random.default_rng(8)
-    for _ in range(6):
-        camera, points, pixels, _ = frame("volume", "right", random)
+def test_points_that_fit_by_chance_claim_no_more_than_where_they_are():
+    """Some of 18 points that are off by up to 15 px fit a motion: none is published as certain."""
+    random, inside = np.random.default_rng(8), []
+    for _ in range(12):
+        camera, points, pixels, rotation = frame("volume", "right", random)
         points, pixels = points[:18], pixels[:18] + random.uniform(-15.0, 15.0, (18, 2))
-        assert not rsl.Localizer(camera).localize(points, pixels)
+        result = rsl.Localizer(camera).localize(points, pixels)
+        if result:
+            off = Rotation.from_matrix(result.rotation @ rotation.T).as_rotvec()
+            inside.append(off @ np.linalg.solve(result.covariance[:3, :3], off) < 16.0)
+    assert len(inside) > 3
+    assert all(inside)
 
 
 def test_a_moved_corner_is_a_notice():

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The one linear fit, against dense matrices of plain NumPy."""
 
+import math
+
 import numpy as np
 import pytest
 from scipy.special import logsumexp
@@ -15,6 +17,7 @@ from rs_localizer.estimation.linear_fit import (
     SHARED,
     TURNS,
     VIBRATION,
+    Linear,
     Noise,
     TurnPrior,
     bend_of,
@@ -259,6 +262,23 @@ def test_no_size_of_errors_is_an_exception(noise, size):
     linear = linear_of(far, np.ones(40, bool), True, shared.rows)
     found = fit(linear, shared, known, Noise(noise, 1.0, 18.0), VIBRATION, True)
     assert found.evidence == -np.inf or np.isfinite(found.step).all()
+
+
+def test_noise_that_is_not_expected_speaks_for_vibration():
+    """By a half-normal prior of noise: the more, the more of its variance the vibration takes."""
+    truth, *_, shared, linear = shaking()
+    known, one = known_at(PRIOR, truth), TurnPrior.of(VIBRATION.informations[3:4], np.zeros(1))
+    gains = {}
+    for expected in (math.inf, 1.0, 0.1, 0.01):
+        found = fit(linear, shared, known, Noise(0.3, 1.0, 18.0, expected), one, True)
+        gains[expected] = found.gain
+    still = Linear(linear.every.copy(), linear.beside.copy())
+    still.every[18:72] = still.every[:, 18:72] = 0.0  # nothing of it shows
+    nothing = fit(still, shared, known, Noise(0.3, 1.0, 18.0), one, True)
+    taken = nothing.noise**2 - found.noise**2
+    assert taken > 0.0
+    for expected in (1.0, 0.1, 0.01):
+        assert gains[expected] - gains[math.inf] == pytest.approx(0.5 * taken / expected**2)
 
 
 def test_products_farther_along_the_tangent_leave_the_same_optimum():

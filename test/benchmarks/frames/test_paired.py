@@ -23,7 +23,7 @@ from benchmarks.frames.conditions import (
     named,
 )
 from benchmarks.frames.generated import generate
-from benchmarks.frames.judged import FIGURES, Judged, judge
+from benchmarks.frames.judged import FIGURES, Judged, far_off, judge
 from benchmarks.frames.paired import Result, line, outcome, ratios
 from benchmarks.frames.switches import SWITCHES, found, switched_off
 from benchmarks.independent.scenes import Rich, SmallPlane, Wall
@@ -103,6 +103,14 @@ SEEN_IN = {
     "another-matrix": FOCAL, "by-chance": ROUGH, "window": SHAKEN,
     "learnt-accelerations": SHAKEN,
 }  # fmt: skip
+
+
+def test_few_points_before_a_camera_that_vibrates_have_a_pose():
+    """16 of 20 are right, by 7 px off: rows do not tell how the camera moves, but where it is."""
+    shown = judge(named("noise/1deg/20points/0.3px"), 12, 1, {})
+    assert shown.localized.all()
+    assert not far_off(shown).any()
+    assert shown.of("deg").max() < 10.0
 
 
 @pytest.fixture(scope="module")
