@@ -84,7 +84,7 @@ def _extent(points: Array2) -> float:
     """Return the sum of the variances of points (n,3) along the axes."""
     total = 0.0
     for axis in range(3):
-        total += np.var(points[:, axis])
+        total += float(np.var(points[:, axis]))
     return total
 
 

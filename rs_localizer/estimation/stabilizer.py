@@ -135,7 +135,7 @@ def _varying(values: Array, weights: Array, by_shutter: Array) -> Array:
     told, axes = np.linalg.eigh(normal)
     least = _LEAST_TOLD * told[4]
     found = axes @ ((right @ axes) * np.where(told > least, 1.0 / np.maximum(told, least), 0.0))
-    rest = values - found[:3]
+    rest: Array = values - found[:3]
     for i in range(len(values)):
         rest[i] -= by_shutter[i, :3].copy() @ found[3:]
     return rest
