@@ -230,6 +230,11 @@ class ShutterWatch:
         return self._camera is not None
 
     @property
+    def rows_turn(self) -> bool:
+        """Whether rows rotate otherwise than images: of a stabilized film, or near their rate."""
+        return self._rotations.are_smooth
+
+    @property
     def of_rest(self) -> float:
         """Logarithm of the odds that what looks like motion within an image is none."""
         return _AT_REST if self.is_global else 0.0

@@ -67,6 +67,11 @@ class RowRotations:
         return self.is_certain or (self._smooth > _LIKELY and self._bent <= 0.0)
 
     @property
+    def are_smooth(self) -> bool:
+        """Whether a stabilizer has surely turned the images, unless the camera vibrates."""
+        return self._smooth > 2.0 * _LIKELY
+
+    @property
     def vibrates(self) -> bool:
         """Whether the camera rather vibrates near the rate of the images."""
         return self._smooth > _LIKELY and not self.is_likely
@@ -83,7 +88,7 @@ class RowRotations:
         self._smooth, self.rate, self._bent = _compared(
             turned, weights, covariances, by_shutter, readouts
         )
-        is_new = self._smooth > 2.0 * _LIKELY and self._bent < -_LIKELY
+        is_new = self.are_smooth and self._bent < -_LIKELY
         self.is_certain = is_new or (self.is_certain and self._smooth > _LIKELY)
 
 

@@ -15,7 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import REVERSED, ScanDirection
 from rs_localizer.io.imu import ImuRecording
+from rs_localizer.localizer import Localizer
 from rs_localizer.tools.adjust.bodies import is_flat
 from rs_localizer.tools.adjust.fit import Fit, cheaper, fit, image_speeds
 from rs_localizer.tools.adjust.intrinsics import LensErrors, lens_difference, lens_errors
@@ -40,6 +42,7 @@ from rs_localizer.tools.readout_belief import (
     discrepancy,
     examine,
 )
+from rs_localizer.tracking import Tracker
 
 # Parts of the recording that are calibrated on their own: three at least, for two that agree may do
 # so by chance, and more of a longer one.
@@ -198,7 +201,27 @@ def calibrate(
         except (NoMount, Undetermined) as error:
             no_mount = str(error)
     judged = _judged(camera, posed, observations, stamps, fitted, len(images))
-    return replace(judged, no_mount=no_mount, own_stamps=own_stamps or stamps.irregular)
+    own_stamps = own_stamps or stamps.irregular
+    judged = replace(judged, no_mount=no_mount, own_stamps=own_stamps)
+    if judged.global_shutter or not abs(judged.readout_time) < stamps.interval:
+        return judged
+    direction = ScanDirection(camera.scan_direction)
+    shutter = replace(
+        judged.fit.camera,
+        readout_time=abs(judged.readout_time),
+        scan_direction=direction if judged.readout_time > 0.0 else REVERSED[direction],
+    )
+    return replace(judged, turned=is_turned(shutter, images))
+
+
+def is_turned(camera: Camera, images: list[ImagePoints]) -> bool:
+    """Return whether rows of images rotate otherwise than the images, as of a stabilized film."""
+    tracker, turned = Tracker(Localizer(camera)), False
+    middle_ns = round(-1e9 * camera.readout_time * camera.first_row_time)
+    for image in images:
+        tracker.localize(image.stamp_ns + middle_ns, image.points, image.pixels)
+        turned |= tracker.shutter.rows_turn
+    return turned
 
 
 def _thinned(images: list[ImagePoints]) -> list[ImagePoints]:
@@ -338,6 +361,7 @@ def _judged(
         posed=posed,
         images=images,
         mount=mount,
+        turned=False,
     )
 
 

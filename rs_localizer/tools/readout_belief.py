@@ -133,6 +133,7 @@ class Evidence:
     own_stamps: bool  # the images' own, not those of a rate
     jitter: float  # s rms, by how much images were exposed beside their stamps; 0: they were not
     seconds: float  # how long the images with a pose last
+    turned: bool  # whether rows rotate otherwise than images
 
     @property
     def limit(self) -> float:
@@ -185,6 +186,8 @@ class Evidence:
             why.append(f"parts of the recording disagree ({parts} ms)")
         if self.jitter > _BESIDE:
             why.append(f"exposures are {1e3 * self.jitter:.1f} ms rms off their stamps")
+        if self.turned:
+            why.append("rows rotate otherwise than images")
         return (
             f"{' and '.join(why)}: is image stabilization on, or was the video processed? Record "
             "with the camera's own time stamps, without losing images or re-encoding the video"
