@@ -390,7 +390,7 @@ class FramesTogether:
         self.stretch: Stretch | None = None
         """How frames show the map to be stretched; None: by no more than chance."""
         self.doubt = np.zeros(2)
-        """Logarithms of focal length and fy over fx, over K's, as far as frames doubt K; else 0."""
+        """Deviations (logarithms) of focal length and fy over fx from K's, if frames doubt K."""
 
     @property
     def is_enough(self) -> bool:
@@ -425,7 +425,8 @@ class FramesTogether:
         told = self._beyond(fit, _SURELY, _VIBRATING) > 0.0
         ratios = np.where(told, np.exp(fit.numbers[_OF_K]), 1.0)
         self.matrix = Matrix(*ratios.tolist()) if told.any() else None
-        self.doubt = self._beyond(fit, _DOUBTFULLY)
+        off = np.hypot(fit.numbers[_OF_K], fit.deviations[_OF_K])
+        self.doubt = np.where(self._beyond(fit, _DOUBTFULLY) > 0.0, off, 0.0)
         sizes, deviations = fit.numbers[_STRETCHED], fit.deviations[_STRETCHED]
         by_more = np.sqrt(np.maximum(sizes**2 - deviations**2, 0.0))
         # Frames that do not tell the readout time are not of the motion between them, or at rest.
