@@ -224,8 +224,10 @@ def test_random_matches_have_no_pose():
     for _ in range(10):
         points = rng.uniform([-2, -2, 3], [2, 2, 7], (100, 3))
         result = localizer.localize(points, rng.uniform([0, 0], [639, 479], (100, 2)))
-        assert result.reason in (rsl.Reason.TOO_FEW_INLIERS, rsl.Reason.RESIDUAL)
-        assert result.reason == rsl.Reason.RESIDUAL or "8 are needed" in result.detail
+        assert not result
+        assert result.reason == rsl.Reason.RESIDUAL or (
+            "8 are needed" in result.detail or "fit by chance" in result.detail
+        )
 
 
 def adversarial():

@@ -372,7 +372,7 @@ def by_chance(observed: Observed, posterior: Posterior, threshold: float) -> Fai
     """Return the failure of a motion that fits no more points than chance makes fit.
 
     Points near their places may be those of a camera that vibrates, or of a rough map: they fit by
-    chance unless a motion is surprising among them. Where the gate was widened for them, a pose is,
+    chance unless a motion is surprising among them. Where the gate was widened for them, it is one
     among points that lie anywhere.
     """
     errors, inliers = posterior.squared_errors, posterior.inliers
@@ -381,15 +381,15 @@ def by_chance(observed: Observed, posterior: Posterior, threshold: float) -> Fai
     # Of a rough map, or a short focal length, the gate may be as wide: others need room beside it.
     circle = max((GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length) ** 2, 4.0 * gate)
     near = int(np.count_nonzero(errors <= circle))
+    total, area = near, circle
     if posterior.gate > _WIDE * threshold:
-        total, sample, area = len(errors), _OF_POSE, _area(observed) / math.pi
+        total, area = len(errors), _area(observed) / math.pi
     elif near <= found + _MARKER:
         return None
-    else:
-        total, sample, area = near, PARAMETERS // 2, circle
     # One point may fill the gate, as a near one does of a rough map: so many others fit better.
     best, sizes = np.sort(errors[inliers]), (found, 3 * found // 4, found // 2)
-    surprises = [_surprise(total, k, sample, float(best[k - 1]) / area) for k in sizes if k]
+    chances, sample = best / area, PARAMETERS // 2
+    surprises = [_surprise(total, k, sample, float(chances[k - 1])) for k in sizes if k]
     if max(surprises, default=0.0) > _LEAST_CHANCE:
         return None
     return Failure(
