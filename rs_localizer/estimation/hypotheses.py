@@ -387,6 +387,8 @@ def _vibrating(
         if np.count_nonzero(now.inliers) < _FEWEST_TURNING:
             return None
         shared = smooth_error(now.lines, now.inliers, given.bend, given.size).at(given.size)
+        if not len(shared.squares):  # columns of an absurd motion are no numbers
+            return None
         still = apply_step(now.state, -MIDDLE @ now.turn)
         # From a camera that does not move or turn: the prior of one at rest is so sure of it that
         # rounding would show.

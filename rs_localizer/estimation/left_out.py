@@ -375,7 +375,8 @@ def by_chance(observed: Observed, posterior: Posterior, threshold: float) -> Fai
     chance unless a motion is surprising among them. Where the gate was widened for them, it is one
     among points that lie anywhere.
     """
-    errors, inliers = posterior.squared_errors, posterior.inliers
+    errors = posterior.squared_errors
+    inliers = posterior.inliers & np.isfinite(errors)  # a gate may be as wide as a motion is absurd
     found = int(np.count_nonzero(inliers))
     gate = float(errors[inliers].max(initial=0.0))
     # Of a rough map, or a short focal length, the gate may be as wide: others need room beside it.

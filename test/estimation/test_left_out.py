@@ -152,6 +152,17 @@ def test_near_points_of_a_rough_map_do_not_make_the_others_fit_by_chance(seed):
     assert off @ np.linalg.solve(result.covariance[:6, :6], off) < 22.5  # 99.9 %
 
 
+def test_gates_as_wide_as_a_motion_is_absurd_are_no_error():
+    """Wrong matches of a map of 0.3 m: some fits leave errors that no number holds."""
+    camera = rsl.Camera(640, 480, [[500, 0, 319.5], [0, 500, 239.5], [0, 0, 1]], readout_time=0.03)
+    localizer, random = rsl.Localizer(camera, map_deviation=0.3), np.random.default_rng(3)
+    wall = np.column_stack([random.uniform(-3.0, 3.0, (400, 2)), np.full(400, 3.0)])
+    for _ in range(24):
+        matches = wall[random.integers(0, 400, 100)] + 0.3 * random.normal(size=(100, 3))
+        result = localizer.localize(matches, random.uniform(0.0, [639.0, 479.0], (100, 2)))
+        assert not result
+
+
 def test_points_that_fit_by_chance_claim_no_more_than_where_they_are():
     """Some of 18 points that are off by up to 15 px fit a motion: none is published as certain."""
     random, inside = np.random.default_rng(8), []
