@@ -316,7 +316,9 @@ def summary(tally: Tally, config: NodeConfig, out: Path, timed: bool = True) -> 
     if (fault := readout_fault(config.readout_time, tally.period)) is not None:
         lines.append(f"warning: {fault}")
     if tally.localized and not tally.moving:
-        why = f"solver {config.solver} estimates no velocities"
+        why = "no frame determines them"
+        if not find_solver(config.solver).rolling_shutter:
+            why = f"solver {config.solver} estimates no velocities"
         if config.readout_time == 0.0:
             why = "readout_time is 0 (unknown); give it with -p readout_time:=SECONDS"
         lines.append(f"no twists: {why}")

@@ -246,6 +246,8 @@ class CameraFrames(FrameLocalizer):
         self, cloud: Correspondences, result: Estimate | Failure, moment: PublishedMoment
     ) -> Localized | Refusal:
         """Return a result of the body at the published moment."""
+        if self._tracker.lens.fault and not self._scale_is_odd:
+            self._notice(Notice.LENS, self._tracker.lens.fault)
         if not result:
             return Refusal(result.reason, result.detail)
         if result.integrity > DOUBTFUL:
@@ -260,8 +262,6 @@ class CameraFrames(FrameLocalizer):
                 self._notice(Notice.STALE_LANDMARKS, said)
         if result.left_out:
             self._notice(Notice.DOUBTFUL, result.left_out)
-        if self._tracker.lens.fault and not self._scale_is_odd:
-            self._notice(Notice.LENS, self._tracker.lens.fault)
         return self._result(cloud, result, moment, self._config.readout_time_deviation)
 
     def _delayed(self, newest: Localized | Refusal, stamp_ns: int) -> Localized | Refusal | None:

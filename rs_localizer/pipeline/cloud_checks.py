@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -81,7 +82,7 @@ _FLAT, _ROUND = 0.01, np.array([1.0, -1.0, 1.0, -1.0])
 # Corners that are seen where others are expected; the same ones are alike to 1.
 _ALIKE = 0.7
 # A way along the line of sight, but for a deviation of a fifth: another size looks like that.
-_ALONG = 1.2
+_ALONG, _RESIZED = 1.2, 0.05  # of a share that a pixel of a small marker is
 
 
 def stale_landmarks(
@@ -151,6 +152,8 @@ def _elsewhere(
     far, side = np.linalg.norm(centres - place, axis=1), np.linalg.norm(shape[0])
     way, nearest = float(far[marker]), int(np.argmin(far))
     alike = np.sum(across * expected) / (np.linalg.norm(across) * np.linalg.norm(expected))
+    if not math.isfinite(way):
+        return "is seen as one point"
     if way < side and alike < _ALIKE:
         return "is turned there, or its corners come in another order"
     x, y, z = place
@@ -158,7 +161,7 @@ def _elsewhere(
     if nearest != marker and far[nearest] < side:
         return f"{said}, where the map has {markers.names[nearest]}"
     seen_at, mapped = (float(np.linalg.norm(each - eye)) for each in (place, centres[marker]))
-    if way < _ALONG * abs(seen_at - mapped):
+    if way < _ALONG * abs(seen_at - mapped) and abs(seen_at - mapped) > _RESIZED * mapped:
         said += f", or measures {mapped / seen_at:.2g} times what the map says"
     return said
 
