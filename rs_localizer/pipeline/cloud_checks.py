@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -81,8 +80,9 @@ _OF_MARKER = 2
 _FLAT, _ROUND = 0.01, np.array([1.0, -1.0, 1.0, -1.0])
 # Corners that are seen where others are expected; the same ones are alike to 1.
 _ALIKE = 0.7
-# A way along the line of sight, but for a deviation of a fifth: another size looks like that.
-_ALONG, _RESIZED = 1.2, 0.05  # of a share that a pixel of a small marker is
+# A way along the line of sight, but for a deviation of a fifth: another size looks like that, if it
+# is by this share of the distance at least, as which a pixel of a small marker looks.
+_ALONG, _RESIZED = 1.2, 0.05
 
 
 def stale_landmarks(
@@ -148,12 +148,12 @@ def _elsewhere(
     seen, expected = (each / (each @ axis)[:, None] for each in (away, corners - eye))
     middle = seen.mean(axis=0)
     across, expected = seen - middle, expected - expected.mean(axis=0)
+    if np.linalg.norm(across) < _FLAT * np.linalg.norm(expected):
+        return "is seen as one point"
     place = eye + middle / np.linalg.norm(np.linalg.lstsq(shape, across, _FLAT)[0], 2)
     far, side = np.linalg.norm(centres - place, axis=1), np.linalg.norm(shape[0])
     way, nearest = float(far[marker]), int(np.argmin(far))
     alike = np.sum(across * expected) / (np.linalg.norm(across) * np.linalg.norm(expected))
-    if not math.isfinite(way):
-        return "is seen as one point"
     if way < side and alike < _ALIKE:
         return "is turned there, or its corners come in another order"
     x, y, z = place
