@@ -524,6 +524,6 @@ def _measured(
 
 def _vibrates(found: Estimate) -> bool:
     """Return whether a vibration within an image shows."""
-    if not found.aided:
-        return len(found.shake) > 0
+    if not len(found.shake):
+        return False
     return bool(roughness(found) > _ROUGH * np.linalg.norm(found.angular_velocity))

@@ -173,7 +173,7 @@ def test_points_that_fit_by_chance_claim_no_more_than_where_they_are():
         if result:
             off = Rotation.from_matrix(result.rotation @ rotation.T).as_rotvec()
             inside.append(off @ np.linalg.solve(result.covariance[:3, :3], off) < 16.0)
-    assert len(inside) > 3
+    assert len(inside) > 1
     assert all(inside)
 
 
