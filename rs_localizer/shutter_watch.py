@@ -330,7 +330,8 @@ class ShutterWatch:
 
     def _measure(self, now: _Look, way: _Way) -> None:
         """Add the evidence of a frame."""
-        # The noise of poses is in both, as if the camera shook: what it makes is taken off.
+        # The noise of poses looks like shaking, and is taken off. In the squared speed it is two
+        # variances of a pose over the squared time, in the squared change, as it counts here, 24.
         changes = 0.25 * way.seconds**2 * way.change @ way.change - 12.0 * way.noise
         speeds = way.speed @ way.speed - way.noise
         self._speeds = _MEMORY * self._speeds + [speeds, changes]

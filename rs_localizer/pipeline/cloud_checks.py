@@ -78,7 +78,8 @@ _NAMED = 12
 _OF_MARKER = 2
 # Corners are those of a square: what is out of it by such a share is rounding, or no marker.
 _FLAT, _ROUND = 0.01, np.array([1.0, -1.0, 1.0, -1.0])
-# Corners that are seen where others are expected; the same ones are alike to 1.
+# A marker is turned if its corners are less alike than this, the cosine of 45 deg: halfway to where
+# the next corner is expected.
 _ALIKE = 0.7
 # A way along the line of sight, but for a deviation of a fifth: another size looks like that, if it
 # is by this share of the distance at least, as which a pixel of a small marker looks.

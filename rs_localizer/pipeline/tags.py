@@ -36,7 +36,7 @@ class Tags:
             m.family.kind.replace("apriltag_", "tag"): m.family.kind for m in marker_map.markers
         }
         self.names = [f"{m.family.kind} {m.id}" for m in marker_map.markers for _ in range(4)]
-        """Of the ids of correspondences: rows of the map's points."""
+        """Names of the corners; the ids of correspondences are their places."""
         self.corners = np.array([marker.corners for marker in marker_map.markers])  # (n,4,3)
 
     def match(self, message: Any) -> Correspondences | Refusal:
