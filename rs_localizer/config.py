@@ -56,7 +56,11 @@ _UNIT = re.compile(r", in ([^\s;,]+)(?=[;,]|$)")
 
 
 def check(config: Any, prefix: str = "") -> None:
-    """Raise ``ValueError`` for the first setting whose type, range or choice is wrong."""
+    """Raise ``ValueError`` for the first setting whose type, range or choice is wrong.
+
+    Numbers of other types, as 2 or ``np.float32(2)`` for 2.0, become those of the setting: kernels
+    take no others.
+    """
     for item in fields(config):
         if not item.metadata:
             continue
@@ -81,6 +85,8 @@ def check(config: Any, prefix: str = "") -> None:
             unit = _UNIT.search(item.metadata["description"])
             unit_name = f" {unit[1]}" if unit else ""
             raise ValueError(f"{name} must lie between {low} and {high}{unit_name}, got {value!r}")
+        if isinstance(default, (int, float)):
+            object.__setattr__(config, item.name, type(default)(value))
 
 
 def type_of(default: Any) -> str:

@@ -67,11 +67,12 @@ class RepeatedImages:
         ]
 
     def are_all(self, points: Any, pixels: Any) -> bool:
-        """Return whether all images of a frame are copies, of the same points."""
-        return all(
+        """Return whether a frame has images, and all are copies, of the same points."""
+        names = _names(points)
+        return bool(names) and all(
             (shown := self._shown.get(name)) is not None
             and all(map(np.array_equal, _image(name, points, pixels), (shown.points, shown.pixels)))
-            for name in _names(points)
+            for name in names
         )
 
     def add(self, time_ns: int, points: Any, pixels: Any) -> None:

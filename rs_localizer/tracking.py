@@ -247,13 +247,17 @@ class Tracker:
             for limit, step in ((most.angular, turn), (most.linear, way))
         )
 
-    def _check_time(self, time_ns: int) -> None:
-        """Raise ``ValueError`` for a time that cannot be in nanoseconds."""
+    def _checked(self, time_ns: int) -> int:
+        """Return a time as Python's integer; ``ValueError``: it cannot be in nanoseconds.
+
+        Differences of NumPy's unsigned integers would wrap around.
+        """
         if isinstance(time_ns, bool) or not isinstance(time_ns, (int, np.integer)):
             raise ValueError(
                 f"time_ns must be a whole number of nanoseconds, got {time_ns!r} "
                 f"({type(time_ns).__name__}): round(1e9 * seconds)"
             )
+        time_ns = int(time_ns)
         before, self._last_ns = self._last_ns, time_ns
         step = _LEAST_STEP_NS if before is None else time_ns - before
         self._too_close = self._too_close + 1 if 0 < step < _LEAST_STEP_NS else 0
@@ -265,13 +269,14 @@ class Tracker:
                 f"frames are {step} ns apart: time_ns is in nanoseconds, 1e9 of a second, 1e6 of "
                 "a millisecond and 1e3 of a microsecond"
             )
+        return time_ns
 
     def expect(self, time_ns: int, prior: Prior) -> None:
         """Let the frame at this time be found near a motion that others know.
 
         It is ignored if the frames before predict the motion, which they know better.
         """
-        self._given = time_ns, prior
+        self._given = int(time_ns), prior
 
     def prediction(
         self, time_ns: int, span: float | None = None, context: FrameContext = ORDINARY
@@ -280,7 +285,7 @@ class Tracker:
 
         ``span`` is the time (s) of the frame's rows; None: that of the last frame.
         """
-        track = self._track
+        track, time_ns = self._track, int(time_ns)
         if track is None or not self._follows(time_ns):
             given = self._given
             return given[1] if given is not None and given[0] == time_ns else None
@@ -303,7 +308,7 @@ class Tracker:
             readings: of the aid, from before the last frame with a pose until now; after that
                 frame, the camera rotates as they say.
         """
-        track = self._track
+        track, time_ns = self._track, int(time_ns)
         if track is None:
             return None
         # Of frames that failed since there may be more than are kept.
@@ -414,8 +419,7 @@ class Tracker:
             exposure = self.localizer.rig.exposure(tuple(points), stamps)
             later, span = round(1e9 * exposure.time), exposure.span
         if self.remembers_motion:
-            self._check_time(time_ns)
-            time_ns += later
+            time_ns = self._checked(time_ns) + later
             if not self._follows(time_ns):
                 self._track = None
         elif self.aid is not None:

@@ -10,6 +10,7 @@ import re
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -216,6 +217,23 @@ def test_a_far_origin_and_turned_map_change_nothing_but_the_map():
     np.testing.assert_allclose(there.position, turn @ here.position + shift, atol=1e-5)
     np.testing.assert_allclose(there.linear_velocity, here.linear_velocity, atol=1e-5)
     np.testing.assert_array_equal(there.inliers, here.inliers)
+
+
+def test_numbers_of_other_types_are_those_of_the_settings():
+    points, pixels = FRAMES[0]
+    given = {
+        "inlier_threshold": 2, "confidence": np.float32(0.5), "map_deviation": Fraction(1, 128),
+        "solver_iterations": np.int32(50), "min_inliers": np.int64(9),
+    }  # fmt: skip
+    plain = {name: type(getattr(NodeConfig(), name))(value) for name, value in given.items()}
+    found = [
+        rsl.Localizer(camera(readout_time=time), **numbers).localize(points, pixels)
+        for time, numbers in ((Fraction(1, 32), given), (1 / 32, plain))
+    ]
+    later = [found[0].at_time(seconds) for seconds in (np.float32(0.25), 0.25)]
+    for one, other in (found, later):
+        np.testing.assert_array_equal(one.rotation, other.rotation)
+        np.testing.assert_array_equal(one.covariance, other.covariance)
 
 
 def test_random_matches_have_no_pose():

@@ -181,6 +181,14 @@ def test_a_camera_of_a_rig_that_hangs_is_named():
     assert "the pixels of right are those" in found[2].detail
 
 
+def test_a_frame_without_images_repeats_none():
+    rig = rsl.Rig({"a": CAMERA}, {"a": (np.eye(3), np.zeros(3))})
+    tracker = Tracker(rsl.Localizer(rig))
+    assert tracker.localize(ns(0.0), {"a": shown(hand, 0.0)})
+    with pytest.raises(ValueError, match="the frame has no image"):
+        tracker.localize(ns(0.1), {})
+
+
 def test_what_is_no_image_that_came_before(held):
     """An array that is used again; and any image where no prediction says that the camera moves."""
     times, frames = held

@@ -389,6 +389,18 @@ def test_times_in_other_units_are_refused(stamps, pairs):
         tracker.localize(first + pairs * (second - first), points, pixels)
 
 
+def test_stamps_of_unsigned_integers_are_those_of_python():
+    found = []
+    for kind in (int, np.uint64):
+        tracker, hand = Tracker(rsl.Localizer(CAMERA)), Hand()
+        for k in range(4):
+            tracker.localize(kind(10**9 + k * 33_000_000), *hand.frame(0.033 * k, 40))
+        times = kind(10**9 + 70_000_000), kind(10**9 + 120_000_000)
+        found.append([*map(tracker.at, times), tracker.prediction(times[1])])
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
 def test_after_a_third_of_a_second_without_the_board_no_pose_jumps():
     """A single board of 48 corners, by P3P up to 5 deg off; before and after, half a degree.
 

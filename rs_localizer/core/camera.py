@@ -222,6 +222,7 @@ class Camera:
             )
         if not isinstance(self.readout_time, Real) or not 0.0 <= self.readout_time < math.inf:
             raise ValueError(f"readout_time must be 0 or more seconds, got {self.readout_time!r}")
+        object.__setattr__(self, "readout_time", float(self.readout_time))
         if self.readout_time > _LONGEST_READOUT:
             raise ValueError(
                 f"readout_time must be at most {_LONGEST_READOUT:g} s, got {self.readout_time:g}: "

@@ -177,7 +177,7 @@ class Estimate(Motion):
                 f"{seconds:g} s from the middle row is too far: the time is in seconds, and no "
                 f"motion goes on for more than {_LONGEST_AWAY:g}"
             )
-        tau = seconds / self.span
+        tau = float(seconds) / self.span
         later, transport = carried(numbers_of(self), tau, _NO_FADING)
         rotation, translation = self._at(tau)
         values, rates = np.zeros(FUNCTIONS), np.zeros(FUNCTIONS)
