@@ -162,6 +162,28 @@ def test_a_robot_that_starts_after_rest_is_covered(rate):
     assert max(doubts) < 0.5
 
 
+class ShakenHand(Hand):
+    """Turns and goes to and fro up to six times a second, by 0.1 rad and 3 cm."""
+
+    def rotations(self, t):
+        cycles = 2.0 * np.pi * np.array([[1.3, 2.9, 4.7], [2.3, 3.7, 5.9]])
+        phases = np.asarray(t)[..., None, None] * cycles + np.array([[0, 1, 2], [3, 5, 4]])
+        turn, place = np.moveaxis(np.sin(phases), -2, 0)
+        return Rotation.from_rotvec(0.14 * turn), 0.04 * place
+
+
+@pytest.mark.parametrize("rate", [1.5, 3.0])
+def test_the_way_between_rare_images_does_not_tell_how_fast_a_hand_shakes(rate):
+    """Half of the poses were up to 26 m off, where points told nothing of what had surprised."""
+    hand, tracker, far = ShakenHand(), Tracker(rsl.Localizer(CAMERA)), []
+    for t in np.arange(20) / rate:
+        result = tracker.localize(ns(t), *hand.frame(t, 150, noise=0.5))
+        far.append(twist_distance(result, hand.motion(t)))
+        assert error(result, hand.motion(t))[0] < 0.03
+    assert np.mean(np.array(far) < 12.6) > 0.85
+    assert max(far) < 38.0  # once in a million by chance
+
+
 def test_sharp_poses_do_not_make_the_velocity_ring():
     """Without noise nothing but the filter itself could swing from frame to frame."""
     hand = Hand()

@@ -24,6 +24,10 @@ accelerations that last.
 Who rests may start at any time, before a scale can be learnt anew. So the motion is a mixture: in
 the last transitions accelerations are those that were learnt, or three or ten times as large, up to
 the settings'. Its mean and its region are weighed as those of one frame (docs/estimator.md).
+
+A hand that images see once or thrice a second has turned back between them: their way does not tell
+its velocity. So velocities in images may also differ from those of the trajectory, by deviations of
+four sizes, each a part of the mixture.
 """
 
 from __future__ import annotations
@@ -84,8 +88,13 @@ _LEAST_SCALE, _MOST_SCALE = 0.03, 100.0
 # Accelerations of the last transitions may be so many times as large as they were learnt. In the
 # mean, the logarithm of the odds that they are not: at 30 Hz one start in two seconds.
 _GROWN, _ODDS, _RECENT = (1.0, 3.0, 10.0), math.log(20.0), 3
+# Deviations of velocities in images from the trajectory's, over configured accelerations times the
+# time between images, if that (s) is longer: below, they change no twist of hands nor of a phone.
+_SWINGS, _SLOW = (0.01, 0.03, 0.1, 0.3), 0.15
 # Who turns about one axis turns a little about the others: of the largest deviation.
 _LEAST_SHARE = 0.3
+# Deviations between points and prior, along each axis: more are no Gaussians.
+_MOST_APART = 8.0
 # Derivatives of a motion without its vibration by motion and coefficients.
 _UNSHAKEN = np.eye(PARAMETERS, PARAMETERS + 3 * len(MIDDLE_VALUES))
 _UNSHAKEN[TURN, PARAMETERS:] = -np.kron(MIDDLE_VALUES, np.eye(3))
@@ -274,10 +283,11 @@ class MotionWindow:
         seconds: Array = np.diff(self.times).astype(np.float64) * 1e-9
         scales: Array = np.stack([self.configured, self.deviations])
         found = list[_Solved]()
-        for grown in _GROWN:
+        swings = _SWINGS if np.median(seconds) > _SLOW else ()
+        for grown, swing in (*((grown, 0.0) for grown in _GROWN), *((1.0, x) for x in swings)):
             found.append(_Solved(*_solve(
                 seconds, states, informations, gradients, self.start.state, self.start.covariance,
-                scales, self.readout_share, 0 if found else rounds, smooths, grown,
+                scales, self.readout_share, 0 if found else rounds, smooths, grown, swing,
             )))  # fmt: skip
             scales = np.stack([self.configured, found[0].deviations])
         return tuple(found)
@@ -367,7 +377,7 @@ def singer(seconds: float, fading: float) -> Array:
 def _solve(
     seconds: Array1, states: Array2, informations: Array3, gradients: Array2, start: Array1,
     start_covariance: Array2, scales: Array2, readout_share: float, rounds: int, smooths: bool,
-    grown: float,
+    grown: float, swing: float,
 ) -> tuple[Array, Array, Array, float, float]:  # fmt: skip
     """Filter, learn deviations and perhaps smooth: the fields of :class:`_Solved`.
 
@@ -377,14 +387,21 @@ def _solve(
         rounds: of learning.
         smooths: all samples tell of all motions.
         grown: factor of the deviations of the last transitions.
+        swing: deviation of velocities beside the trajectory's, over configured accelerations times
+            seconds; 0: none.
     """
     count, configured, deviations = len(seconds), scales[0], scales[1].copy()
     square, row = (count + 1, PARAMETERS, PARAMETERS), (count + 1, STATE_SIZE)
     predicted, filtered = np.empty(row), np.empty(row)
     predictions, transports, knowns = np.empty(square), np.empty(square), np.empty(square)
-    covariances = np.empty(square)
+    covariances, beside = np.empty(square), 0.0
+    told, pulls = informations, gradients
+    if swing > 0.0:
+        informations, gradients = told.copy(), pulls.copy()
+        for k in range(count):
+            beside += _of_trajectory(informations[k], gradients[k], swing * seconds[k] * configured)
     while True:
-        filtered[0], covariances[0], surprise, evidence = start, start_covariance, 0.0, 0.0
+        filtered[0], covariances[0], surprise, evidence = start, start_covariance, 0.0, beside
         for k in range(count):
             own = enlarged(deviations, configured, grown if k >= count - _RECENT else 1.0)
             predicted[k], predictions[k], transports[k] = _predicted(
@@ -421,7 +438,48 @@ def _solve(
         deviations[:3] = np.maximum(deviations[:3], _LEAST_SHARE * deviations[:3].max())
         is_settled = np.max(np.abs(np.log(deviations / before))) < _SETTLED
         rounds = 0 if is_settled else rounds - 1
+    for k in range(count if swing > 0.0 else 0):
+        spread = _swinging(told[k], swing * seconds[k] * configured)
+        kept = np.eye(PARAMETERS) - spread @ told[k]
+        step = kept @ step_between(states[k], filtered[k + 1]) + spread @ pulls[k]
+        filtered[k + 1] = apply_step(states[k], step)
+        covariances[k + 1] = kept @ covariances[k + 1] @ kept.T + spread
     return filtered, covariances, deviations, surprise, evidence
+
+
+@kernel
+def _swinging(information: Array2, deviations: Array1) -> Array:
+    """Return the covariance (18,18) of velocities beside a trajectory that is known.
+
+    Args:
+        information: (18,18) of an image.
+        deviations: (4,) of these velocities.
+    """
+    inner = np.ascontiguousarray(information[6:12, 6:12])
+    for axis in range(6):
+        inner[axis, axis] += deviations[min(axis, 3)] ** -2
+    spread = np.zeros((PARAMETERS, PARAMETERS))
+    spread[6:12, 6:12] = inverted(inner)
+    return spread
+
+
+@kernel
+def _of_trajectory(information: Array2, gradient: Array1, deviations: Array1) -> float:
+    """Turn what an image tells of its motion into what it tells of the trajectory.
+
+    Returns:
+        the logarithm of the factor of its likelihood.
+    """
+    spread, volume = _swinging(information, deviations), 0.0
+    inner = np.ascontiguousarray(spread[6:12, 6:12])
+    volume -= inverse_of(inner)[1]
+    for axis in range(6):
+        volume += math.log(deviations[min(axis, 3)])
+    volume -= 0.5 * np.sum(gradient * (spread @ gradient))
+    across = information @ spread
+    gradient -= across @ gradient
+    information -= across @ information
+    return -volume
 
 
 @entry
@@ -452,10 +510,17 @@ def _score(
 
 
 @entry
-def _told_by_points(covariance: Array2, known: Array2) -> Array:
-    """Return the information (18,18) of a posterior beyond its prior.
+def _told_by_points(covariance: Array2, known: Array2, slope: Array1) -> tuple[Array, Array]:
+    """Return the information (18,18) of a posterior beyond its prior, and its gradient (18,).
 
-    By the eigenvalues of what was known, in units of the posterior: none of them exceeds 1.
+    By the eigenvalues of what was known, in units of the posterior: none of them exceeds 1. Where
+    points tell little, the slope of a prior that the motion has left far behind would be a step
+    without bounds: it counts as one of so many deviations between points and prior.
+
+    Args:
+        covariance: (18,18) of the posterior.
+        known: (18,18) information of the prior.
+        slope: (18,) gradient of the prior at the posterior's mean.
     """
     whole = inverted(covariance)
     scale = np.sqrt(np.diag(whole))
@@ -464,10 +529,12 @@ def _told_by_points(covariance: Array2, known: Array2) -> Array:
     back = np.linalg.inv(factor)
     part = back @ (known / units) @ back.T
     values, vectors = np.linalg.eigh(0.5 * (part + part.T))
-    roots = np.ascontiguousarray(vectors * np.sqrt(np.maximum(1.0 - values, 0.0)))
-    half = np.ascontiguousarray(factor) @ roots
-    told: Array = (half @ half.T) * units
-    return told
+    told = np.maximum(1.0 - values, 0.0)
+    axes = np.ascontiguousarray(factor) @ np.ascontiguousarray(vectors)
+    half, most = axes * np.sqrt(told), _MOST_APART * np.sqrt(told * np.maximum(values, 0.0))
+    pulls = np.ascontiguousarray(vectors.T) @ (np.ascontiguousarray(back) @ (slope / scale))
+    gradient = scale * (axes @ np.minimum(np.maximum(pulls, -most), most))
+    return (half @ half.T) * units, gradient
 
 
 def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array, Array]:
@@ -520,7 +587,7 @@ def told_of(
     if rotation is not None:
         state[STATE_ANGULAR] += rotation.smooth_rate
         state[STATE_ANGULAR_ACCELERATION] += rotation.change
-    told = MotionSample(time_ns, state, _told_by_points(covariance, information), slope)
+    told = MotionSample(time_ns, state, *_told_by_points(covariance, information, slope))
     return told.over(1.0 / estimate.span)
 
 
