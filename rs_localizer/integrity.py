@@ -116,27 +116,25 @@ class SeenLandmarks:
     """How often landmarks were seen, and how often they were matched."""
 
     def __init__(self) -> None:
-        self._keys = np.array([np.inf])  # of landmarks, in order; the last one is none's
-        self._counts = np.zeros((1, 2))  # seen, kept
+        self._places: dict[float, int] = {}  # of landmarks, by key
+        self._counts = np.zeros((1, 2))  # seen, kept; behind the landmarks are zeros
 
     def add(self, keys: Array, kept: BoolArray) -> None:
         """Count the landmarks of a frame."""
-        place = np.searchsorted(self._keys, keys)
-        if (is_new := self._keys[place] != keys).any():
-            new = np.unique(keys[is_new])
-            before = np.searchsorted(self._keys, new)
-            self._keys = np.insert(self._keys, before, new)
-            self._counts = np.insert(self._counts, before, 0.0, axis=0)
-            place = np.searchsorted(self._keys, keys)
+        if len(self._places) > _MOST_LANDMARKS:  # those that are not in view
+            here = [key for key in keys.tolist() if key in self._places]
+            self._counts = self._counts[[self._places[key] for key in here] + [-1]]
+            self._places = {key: place for place, key in enumerate(here)}
+        places = self._places
+        place = [places.setdefault(key, len(places)) for key in keys.tolist()]
+        if len(places) >= len(self._counts):  # twice as many, so that few are copied
+            self._counts = np.concatenate([self._counts, np.zeros((len(places), 2))])
         self._counts[place] += np.column_stack([np.ones(len(keys)), kept])
-        if len(self._keys) > _MOST_LANDMARKS:  # those that are not in view
-            here = np.append(np.unique(place), len(self._keys) - 1)
-            self._keys, self._counts = self._keys[here], self._counts[here]
 
     def stale(self, keys: Array) -> BoolArray:
         """Return which landmarks, by key, were seen too often to be unmatched by chance."""
-        place = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)  # NaN is behind
-        found: BoolArray = self._keys[place] == keys
+        place = np.array([self._places.get(key, -1) for key in keys.tolist()], np.int64)
+        found: BoolArray = place >= 0
         if found.any():
             seen, kept = self._counts[place].T
             every = self._counts.sum(axis=0)

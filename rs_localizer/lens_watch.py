@@ -11,6 +11,7 @@ board none shows it, because motion takes up what it leaves; frames together do
 from __future__ import annotations
 
 import math
+import statistics
 from collections import deque
 from dataclasses import replace
 
@@ -153,7 +154,7 @@ class LensWatch:
         self._sizes.append((found.model_error, found.declared_error))
         if len(self._sizes) < _FRAMES:
             return
-        off, declared = np.median(self._sizes, axis=0)
+        off, declared = map(statistics.median, zip(*self._sizes, strict=True))
         allowed = self._allowed(declared)
         self._smooth = (
             f"residuals vary smoothly over the image ({off:.2g} px rms), more than the deviations "

@@ -26,14 +26,15 @@ import numpy as np
 
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3, IntArray1
 from rs_localizer.core.lens import centre_of
-from rs_localizer.core.rig import Exposure
-from rs_localizer.core.state import MOVE, VELOCITIES
+from rs_localizer.core.rig import Exposure, Mounts
+from rs_localizer.core.state import MOVE, PARAMETERS, STATE_ANGULAR, STATE_LINEAR, VELOCITIES
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.calibration import LandmarkErrors
-from rs_localizer.estimation.points import Observations, find_usable, packed
+from rs_localizer.estimation.points import find_usable, pack, packed
 from rs_localizer.estimation.projection import linearized
+from rs_localizer.native import entry
 
 FRAMES = 3
 """Frames that are compared: through them goes one parabola."""
@@ -48,6 +49,7 @@ _KEPT, _KNOWN = 8, 0.02
 _ROUNDS, _LEAST_STEP, _NEAR = 8, 1e-3, (0.3, 0.05, 0.02)
 _EXACT_ROUNDS = 5  # of all threes, three of which are enough before ceilings
 _LEAST_NOISE = 0.1  # px, no real error is smaller
+_OF_MEDIAN = 1.386  # median of the squared errors of a point, over the variance of a coordinate
 # So many threes in a row that do not fit those before are no chance.
 _ODD = 2
 # Focal lengths from which the search also starts, over K's.
@@ -182,19 +184,16 @@ class Stretch(NamedTuple):
 class _Linked(NamedTuple):
     """A frame on its way; the motion within it is that through the poses of two others."""
 
-    seen: Observations
+    points: Array2  # (n,3), with the fields of :class:`Observations` behind it
+    rays: Array2
+    tau: Array1
+    by_ray: Array3
+    camera: IntArray1
+    mounts: Mounts
     others: tuple[int, int]
-    away: Array  # (2,) times to the others, readouts
-    shifted: Array  # (2,) their derivatives by the stamp of the middle frame
-    moved: Array  # (n,3,5) points by errors of the map
-
-
-def _slopes(away: Array) -> Array:
-    """Return velocity and acceleration (2,2) by the ways to two others, per readout."""
-    first, second = away
-    columns = np.array([[0.5 * second**2, -0.5 * first**2], [-second, first]])
-    slopes: Array = columns / (0.5 * first * second * (second - first))
-    return slopes
+    away: Array1  # (2,) times to the others, readouts
+    shifted: Array1  # (2,) their derivatives by the stamp of the middle frame
+    moved: Array3  # (n,3,5) points by errors of the map
 
 
 class _Equations(NamedTuple):
@@ -224,7 +223,7 @@ class _Three:
             turn, place = each.found.rotation, each.found.position - map_.centre
             self.poses.append((turn, turn.T @ ((turn @ place) * [1.0, 1.0, math.exp(length)])))
         turn, place = self.poses[1]
-        self.depth = abs(float(np.median((self.frames[1].seen.points - place) @ turn[2])))
+        self.depth = abs(float(np.median((self.frames[1].points - place) @ turn[2])))
         self.known = self._known()  # of its own numbers beforehand, as information (25,)
         self.own = np.zeros(_OWN)  # that of the poses stays zero
         residuals = np.concatenate([each.found.residuals[each.found.inliers] for each in posed])
@@ -248,25 +247,8 @@ class _Three:
             self._move(there.step + there.by_shared @ (numbers - there.numbers))
         lines = [self.lines(k, numbers, principal) for k in range(FRAMES)]
         errors, columns = (np.concatenate(part) for part in zip(*lines, strict=True))
-        squared = np.square(errors).sum(axis=1)
-        squared = np.where(np.isnan(squared), np.inf, squared)
-        near = np.isfinite(columns.sum(axis=(1, 2)) + squared)
-        variance = max(_variance(squared), least)
-        weights = np.repeat(1.0 / (variance + squared[near] / 9.0), 2)
-        rows, off = columns[near].reshape(-1, _OWN + _SHARED), errors[near].ravel()
-        weighed = rows.T * weights
-        every, slope = weighed @ rows, weighed @ off
-        own = every[:_OWN, :_OWN] + np.diag(self.known)
-        crossed, pull = every[:_OWN, _OWN:], slope[:_OWN] + self.known * self.own
-        gain = np.linalg.solve(own, np.column_stack([crossed, pull]))
-        self.equations = _Equations(
-            numbers,
-            every[_OWN:, _OWN:] - crossed.T @ gain[:, :-1],
-            slope[_OWN:] - crossed.T @ gain[:, -1],
-            -gain[:, -1],
-            -gain[:, :-1],
-            squared,
-        )
+        reduced = _reduced(errors, columns, self.known, self.own, least)
+        self.equations = _Equations(numbers, *reduced)
 
     def _known(self) -> Array:
         frame = self.frames[1]
@@ -298,54 +280,118 @@ class _Three:
 
     def lines(self, k: int, numbers: Array, principal: Array) -> tuple[Array, Array]:
         """Return errors (n,2) of a frame, and their derivatives (n,2,36) by own and shared ones."""
-        frame, (rotation, place) = self.frames[k], self.poses[k]
-        ways = np.array([self._way(k, other) for other in frame.others])
-        more, longer, aspect = numbers[:3]
-        readout, away = 1.0 + more, frame.away + self.own[_STAMP] * frame.shifted
-        scale, length = np.exp(longer + aspect * _ASPECT), math.exp(longer)
-        shift = (length - 1.0) * principal
-        seen, per_time = frame.seen, readout ** np.array([1.0, 2.0])
-        through = Observations.of(
-            seen.points, (seen.rays - shift) / scale, seen.tau, seen.by_ray * scale, seen.mounts,
-            seen.camera,
-        )  # fmt: skip
-        by_way = _slopes(away)
-        speeds = per_time[:, None] * (by_way @ ways)
-        shifts = frame.shifted[:, None] * np.column_stack([np.ones(2), away])
-        by_stamp = -per_time[:, None] * (by_way @ shifts @ by_way @ ways)
-        moving = speeds + np.outer([_CUBIC[k], 0.0], self.own[_BESIDE])
-        state = np.concatenate([rotation.ravel(), -rotation @ place, moving.ravel()])
-        lines = linearized(through.packed, len(through), state, np.zeros((len(through), 6)))
-        by_poses = np.zeros((2, 6, _STAMP))  # of the ways
-        for each, way, other in zip(by_poses, ways, frame.others, strict=True):
-            turn, about = rotation @ self.poses[other][0].T, _inverse_jacobian(way[:3])
-            each[:3, 6 * k : 6 * k + 3] = -about
-            each[:3, 6 * other : 6 * other + 3] = about @ turn
-            each[3:, 6 * k : 6 * k + 3] = so3.hat(way[3:])
-            each[3:, 6 * k + 3 : 6 * k + 6] = -np.eye(3)
-            each[3:, 6 * other + 3 : 6 * other + 6] = turn
-        by_number = np.zeros((lines.by_motion.shape[2], _OWN + 1))  # of the motion within the frame
-        by_number[:6, 6 * k : 6 * k + 6] = np.eye(6)
-        slopes = per_time[:, None] * by_way @ by_poses.reshape(2, -1)
-        by_number[6:, :_STAMP] = slopes.reshape(-1, _STAMP)
-        by_number[6:, _STAMP] = by_stamp.ravel()
-        by_number[VELOCITIES, _BESIDE] = _CUBIC[k] * np.eye(6)
-        by_number[6:, _OWN + _READOUT] = (speeds * [[1.0], [2.0]]).ravel() / readout
-        columns = np.zeros((len(through), 2, _OWN + _SHARED))
-        by_motion = lines.by_motion.reshape(2 * len(through), -1)  # one product, not one a point
-        columns[:, :, : _OWN + 1] = (by_motion @ by_number).reshape(len(through), 2, -1)
-        shared = columns[:, :, _OWN:]
-        by_length = through.by_ray * lines.image[:, None, :]
-        shared[:, :, _LENGTH] = by_length.sum(axis=2) + seen.by_ray @ (length * principal)
-        shared[:, :, _RATIO] = by_length @ _ASPECT
-        radial = seen.rays * np.square(seen.rays).sum(axis=1, keepdims=True) / self._corner**3
-        shared[:, [0, 1], [_LENS.start, _LENS.start + 1]] = 1.0
-        shared[:, :, _LENS.stop - 1] = np.einsum("nij,nj->ni", seen.by_ray, radial)
-        shared[:, :, _LENS.stop - 1] /= self._focal_length
-        by_point = (by_motion[:, MOVE] @ rotation).reshape(-1, 2, 3)
-        shared[:, :, _MAP] = by_point @ frame.moved
-        errors = lines.errors + shared[:, :, _LENS.start :] @ numbers[_LENS.start :]
+        poses = np.array([np.vstack(pose) for pose in self.poses])
+        lens = np.array([*principal, self._corner, self._focal_length])
+        errors, columns = _lines_of(k, self.frames[k], poses, self.own, numbers, lens)
         return errors, columns
+
+
+@entry
+def _lines_of(
+    k: int, frame: _Linked, poses: Array3, own: Array1, numbers: Array1, lens: Array1
+) -> tuple[Array, Array]:
+    """Return errors (n,2) of a frame, and their derivatives (n,2,36) by own and shared numbers.
+
+    Args:
+        k: the place of the frame among its three.
+        poses: (3,4,3) rotation and place of each.
+        own: (25,) numbers of the three.
+        numbers: (11,) shared ones.
+        lens: (4,) the principal point that moves with the focal length, and the corner, in focal
+            lengths; the focal length, px.
+    """
+    rotation, place, count = poses[k, :3].copy(), poses[k, 3].copy(), len(frame.points)
+    ways, by_poses = np.empty((2, 6)), np.zeros((2, 6, _STAMP))  # of the ways
+    here = 6 * k
+    for i in range(2):
+        each, first = by_poses[i], 6 * frame.others[i]
+        turn = rotation @ poses[frame.others[i], :3].T
+        ways[i, :3] = so3.log(turn)
+        ways[i, 3:] = rotation @ (poses[frame.others[i], 3] - place)
+        hat = so3.hat_of(ways[i, :3])
+        about = np.eye(3) - 0.5 * hat + hat @ hat / 12.0  # inverse of the right Jacobian
+        each[:3, here : here + 3], each[:3, first : first + 3] = -about, about @ turn
+        each[3:, here : here + 3] = so3.hat_of(ways[i, 3:])
+        each[3:, here + 3 : here + 6], each[3:, first + 3 : first + 6] = -np.eye(3), turn
+    readout, length = 1.0 + numbers[_READOUT], math.exp(numbers[_LENGTH])
+    away = frame.away + own[_STAMP] * frame.shifted
+    # Velocity and acceleration by the ways, per readout.
+    before, after = away[0], away[1]
+    by_way = np.array([[0.5 * after**2, -0.5 * before**2], [-after, before]])
+    by_way /= 0.5 * before * after * (after - before)
+    by_way *= np.array([[readout], [readout**2]])
+    speeds = by_way @ ways
+    shifts = np.empty((2, 2))
+    shifts[:, 0], shifts[:, 1] = frame.shifted / readout, frame.shifted * away / readout**2
+    by_stamp = -(by_way @ shifts @ speeds)
+    state = np.concatenate((rotation.ravel(), -(rotation @ place), speeds.ravel()))
+    state[STATE_ANGULAR.start : STATE_LINEAR.stop] += _CUBIC[k] * own[_BESIDE]
+    scale, shift = np.exp(numbers[_LENGTH] + numbers[_RATIO] * _ASPECT), (length - 1.0) * lens[:2]
+    by_ray = frame.by_ray * scale
+    data = pack(
+        frame.points, (frame.rays - shift) / scale, frame.tau, by_ray, frame.camera, frame.mounts
+    )
+    lines = linearized(data, count, state, np.zeros((count, 6)))
+    by_number = np.zeros((PARAMETERS, _OWN + 1))  # of the motion within the frame
+    by_number[:6, here : here + 6] = np.eye(6)
+    by_number[6:, :_STAMP] = (by_way @ by_poses.reshape(2, 6 * _STAMP)).reshape(12, _STAMP)
+    by_number[6:, _STAMP] = by_stamp.ravel()
+    by_number[VELOCITIES, _BESIDE] = _CUBIC[k] * np.eye(6)
+    by_number[6:12, _OWN + _READOUT] = speeds[0] / readout
+    by_number[12:, _OWN + _READOUT] = 2.0 * speeds[1] / readout
+    columns, errors = np.zeros((count, 2, _OWN + _SHARED)), lines.errors.copy()
+    by_own = lines.by_motion.reshape(2 * count, PARAMETERS) @ by_number
+    columns[:, :, : _OWN + 1] = by_own.reshape(count, 2, _OWN + 1)
+    for i in range(count):
+        radial = frame.rays[i] * (np.sum(frame.rays[i] ** 2) / (lens[2] ** 3 * lens[3]))
+        for side in range(2):
+            shared, given = columns[i, side, _OWN:], frame.by_ray[i, side]
+            by_image = by_ray[i, side] * lines.image[i]
+            shared[_LENGTH] = np.sum(by_image) + length * np.sum(given * lens[:2])
+            shared[_RATIO] = np.sum(by_image * _ASPECT)
+            shared[_LENS.start + side] = 1.0
+            shared[_LENS.stop - 1] = np.sum(given * radial)
+            by_point = lines.by_motion[i, side, MOVE] @ rotation
+            shared[_MAP] = by_point @ frame.moved[i]
+            errors[i, side] += np.sum(shared[_LENS.start :] * numbers[_LENS.start :])
+    return errors, columns
+
+
+@entry
+def _reduced(
+    errors: Array2, columns: Array3, known: Array1, own: Array1, least: float
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return the equations of the shared numbers alone: the fields of :class:`_Equations`.
+
+    Args:
+        errors, columns: (n,2) and (n,2,36) of a three.
+        known, own: (25,) information of its own numbers beforehand, and these.
+        least: px^2, variance of the noise.
+    """
+    count, rows = len(errors), columns.copy()
+    squared: Array = np.sum(errors**2, axis=1)
+    squared[np.isnan(squared)] = np.inf
+    ordered = np.sort(squared)
+    middle = 0.5 * (ordered[(count - 1) // 2] + ordered[count // 2])
+    variance = max(middle / _OF_MEDIAN, _LEAST_NOISE**2, least)
+    off = errors.copy()
+    for i in range(count):
+        weight = 1.0 / math.sqrt(variance + squared[i] / 9.0)
+        if not np.isfinite(np.sum(columns[i]) + squared[i]):
+            rows[i], off[i], weight = np.zeros(columns.shape[1:]), np.zeros(2), 0.0
+        rows[i] *= weight
+        off[i] *= weight
+    flat = rows.reshape(2 * count, _OWN + _SHARED)
+    every, slope = flat.T @ flat, off.ravel() @ flat
+    crossed, right = every[:_OWN, _OWN:].copy(), np.empty((_OWN, _SHARED + 1))
+    right[:, :_SHARED], right[:, _SHARED] = crossed, slope[:_OWN] + known * own
+    gain = np.linalg.solve(every[:_OWN, :_OWN] + np.diag(known), right)
+    taken = crossed.T @ gain
+    by_shared = -gain[:, :_SHARED].copy()
+    return (  # type: ignore[return-value]
+        every[_OWN:, _OWN:] - taken[:, :_SHARED], slope[_OWN:] - taken[:, _SHARED],
+        -gain[:, _SHARED].copy(), by_shared, squared,
+    )  # fmt: skip
 
 
 class _Fit(NamedTuple):
@@ -572,19 +618,13 @@ def _frames(exposure: Exposure, posed: Sequence[Fitted], map_: _Landmarks) -> li
         interval = 0.5 * (times[2] - times[0])
         shifted = interval * np.array([(each == 1) - float(k == 1) for each in others])
         seen = packed(exposure, points, near)
-        moved = map_.modes(seen.points)
-        there = times[others] - times[k]
-        frames.append(_Linked(seen, (others[0], others[1]), there, shifted, moved))
+        frames.append(_Linked(
+            seen.points, seen.rays, seen.tau, seen.by_ray, seen.camera, seen.mounts,
+            (others[0], others[1]), times[others] - times[k], shifted, map_.modes(seen.points),
+        ))  # fmt: skip
     return frames
-
-
-def _inverse_jacobian(turn: Array) -> Array:
-    """Return the inverse (3,3) of the right Jacobian at minus a small rotation vector (3,)."""
-    hat = so3.hat(turn)
-    inverse: Array = np.eye(3) - 0.5 * hat + hat @ hat / 12.0
-    return inverse
 
 
 def _variance(squared: Array) -> float:
     """Return the variance (px^2) of one coordinate, by the median of squared errors."""
-    return max(float(np.median(squared)) / 1.386, _LEAST_NOISE**2)
+    return max(float(np.median(squared)) / _OF_MEDIAN, _LEAST_NOISE**2)

@@ -58,6 +58,9 @@ _KNOWN_LEAN = 0.035
 # Steps of the grid of leans in deviations: the trapezoid rule is right to 3e-4 of a Gaussian, and
 # leans pinned to this part of a step are wider by 1e-3.
 _SPACING, _PIN = 1.5, 0.03
+# A mode is nearly Gaussian if the evidence a step beside it falls as its Gaussian does, to this
+# part, and if the mirrored lean adds less than this part to its variance.
+_ALIKE, _NO_PART = 0.15, 0.05
 # Neighbours are looked at of all parts up to these odds (logarithm) against the best: of a Gaussian
 # they reach beyond three deviations.
 _LEAST_PART, _MOST_PARTS = 4.0, 100
@@ -304,7 +307,8 @@ def _leans(frame: Frame, mode: Mode, terms: PriorTerms) -> tuple[Gaussians, floa
     Noise, inliers and the size of the smooth error are taken from the mode.
 
     Returns:
-        Gaussians, none where the lean is known; and the evidence of the mode itself.
+        Gaussians, none where the lean is known, and one if the mode is nearly Gaussian; and the
+        evidence of the mode itself.
     """
     rotation, count = mode.state[:9].copy().reshape(3, 3), len(terms.informations)
     plane, centre, normal = plane_of(frame.points, frame.chosen)
@@ -332,6 +336,8 @@ def _leans(frame: Frame, mode: Mode, terms: PriorTerms) -> tuple[Gaussians, floa
     states, evidences = np.empty((_MOST_PARTS, STATE_SIZE)), np.empty(_MOST_PARTS)
     covariances = np.empty((_MOST_PARTS, PARAMETERS, PARAMETERS))
     starts[0], first, last, best, measured = alone.state, 0, 1, -np.inf, False
+    beside, looked, is_gaussian = 2 * used + 1, 0, True  # the mode, leans beside it, mirrored one
+    falls = np.ones((used, 2))
     while first < last:
         turn = exp(-(places[first] * steps) @ axes)
         references[count], references[count, :9] = starts[first], (turn @ rotation).ravel()
@@ -341,19 +347,22 @@ def _leans(frame: Frame, mode: Mode, terms: PriorTerms) -> tuple[Gaussians, floa
         states[first], covariances[first] = part.state, part.covariance
         evidences[first] = _evidence_of(part, alone.cost, freedom)
         best, first = max(best, evidences[first]), first + 1
-        if first == 2 * used + 1:  # the lean of the mode, and those beside it
-            shrunk = False
+        if first == beside and not measured:
+            falls = (evidences[0] - evidences[1:beside]).reshape(used, 2) / (0.5 * _SPACING**2)
+            is_gaussian = bool(np.max(np.abs(falls - 1.0)) < _ALIKE)
+            measured, shares = True, np.ones(used)
             for axis in range(used):
-                beside = evidences[2 * axis + 1] + evidences[2 * axis + 2]
-                falls = evidences[0] - 0.5 * beside
-                if falls > _SPACING**2 and not measured:
-                    steps[axis] *= max(_SPACING / math.sqrt(2.0 * falls), _LEAST_SHARE)
-                    shrunk = True
-            measured = True
-            if shrunk:
+                fall = np.mean(falls[axis])
+                if fall > 2.0:
+                    shares[axis] = max(1.0 / math.sqrt(fall), _LEAST_SHARE)
+            if np.any(shares < 1.0):
+                steps *= shares
                 first, last, best = 0, 1, -np.inf
                 continue
-            last = _queue(places, starts, last, np.rint(away / steps).astype(np.int64), twin)
+        if first == looked and is_gaussian:
+            twice = np.exp(min(evidences[looked - 1] - evidences[0], 0.0)) * (looked > beside)
+            if np.all(twice * away**2 < _NO_PART * (steps / _SPACING) ** 2):
+                return _bent_by(mode, axes, falls, alone.evidence), alone.evidence
         if not evidences[first - 1] > best - _LEAST_PART:
             continue
         near = states[first - 1]
@@ -366,12 +375,40 @@ def _leans(frame: Frame, mode: Mode, terms: PriorTerms) -> tuple[Gaussians, floa
             begin[:9] = new.ravel()
             begin[9:12] += old @ centre - new @ centre
             last = _queue(places, starts, last, place, begin)
+        if first == 1:
+            looked = _queue(places, starts, last, np.rint(away / steps).astype(np.int64), twin)
+            last = looked
     if not best > -np.inf:
         last = 0
     area = np.prod(steps / (_PIN * steps[used - 1] * math.sqrt(2.0 * math.pi)))
     evidences[:last] += math.log(area)
     turns = np.zeros((last, 0))
     return Gaussians(states[:last], turns, covariances[:last], evidences[:last]), alone.evidence
+
+
+@kernel
+def _bent_by(mode: Mode, axes: Array, falls: Array, evidence: float) -> Gaussians:
+    """Return a mode whose evidence has a third and a fourth order, as one Gaussian.
+
+    Let the logarithm be ``-z^2 / 2 + s z^3 / 3 + c z^4 / 4.5``, with ``z`` in deviations. Then the
+    mean is ``s`` and the variance ``1 + 8 c / 3 + 4 s^2``. The evidence grows by ``2 c / 3 + s^2``.
+
+    Args:
+        axes: (k,3) of the rotation.
+        falls: (k,2) of the evidence a step beside the mode, either way, in those of a Gaussian.
+    """
+    step, covariance = np.zeros(PARAMETERS), mode.covariance.copy()
+    for k in range(len(axes)):
+        along = mode.covariance[:, TURN].copy() @ axes[k]
+        along /= math.sqrt(np.sum(along[TURN] * axes[k]))
+        skew = 0.5 * (falls[k, 1] - falls[k, 0])
+        wide = 1.0 - 0.5 * (falls[k, 0] + falls[k, 1]) + 1.5 * skew**2
+        step += skew * along
+        covariance += 8.0 / 3.0 * wide * np.outer(along, along)
+        evidence += 2.0 / 3.0 * wide
+    states = apply_step(mode.state, step).reshape(1, STATE_SIZE)
+    covariances = covariance.reshape(1, PARAMETERS, PARAMETERS)
+    return Gaussians(states, np.zeros((1, 0)), covariances, np.array([evidence]))
 
 
 @inlined

@@ -405,7 +405,7 @@ def _vibrating(
             linear = changed(linear, coupled)
         known, is_last = known_at(given.terms, still), is_last or k == _STEPS - 1
         seen = Noise(noise, 1.0, float(PARAMETERS), given.assumed.noise)
-        if in_frame is not None:  # a step that is short would change the noise alone
+        if in_frame is not None and k == 0:  # the second step would change the noise alone
             found = fit(linear, shared, known, seen, prior, False)
             noise = max(found.noise, LEAST_NOISE)
             seen = seen._replace(deviation=noise)

@@ -136,13 +136,13 @@ class MotionSample(NamedTuple):
 
 
 class _Solved(NamedTuple):
-    """Motions of n samples, behind the start (n + 1 rows)."""
+    """Motions of n samples, behind the start (n + 1 rows), or of the last of them."""
 
     states: Array  # (n+1,24)
     covariances: Array  # (n+1,18,18)
     deviations: Array  # (4,) as they were learnt
     surprise: float  # squared distance of the last sample from its prediction
-    evidence: float  # logarithm, of all samples
+    evidences: Array  # (n+1,) logarithms, of all samples until each
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,14 +209,14 @@ class MotionWindow:
         odds = np.zeros(len(solved))
         odds[0] = _ODDS
         # From where the camera is: a map's origin may be thousands of kilometres away.
-        states = np.array([one.states[row] for one in solved])
+        states = np.array([one.states[row - len(self)] for one in solved])
         centre = -rotation_of(states[0]).T @ states[0, STATE_TRANSLATION]
         for state in states:
             state[STATE_TRANSLATION] += rotation_of(state) @ centre
         parts = Gaussians(
             states, np.zeros((len(odds), 0)),
-            np.array([one.covariances[row] for one in solved]),
-            np.array([one.evidence for one in solved]),
+            np.array([one.covariances[row - len(self)] for one in solved]),
+            np.array([one.evidences[-1] for one in solved]),
         )  # fmt: skip
         whole = mixture(parts, odds, TEMPER)
         whole.state[STATE_TRANSLATION] -= rotation_of(whole.state) @ centre
@@ -277,19 +277,30 @@ class MotionWindow:
     def _by_samples(self, rounds: int, smooths: bool) -> tuple[_Solved, ...]:
         """Return the motions by all samples or, not smoothed, by those until each.
 
-        The filter, which goes on, is that of the accelerations that were learnt.
+        The filter, which goes on, is that of the accelerations that were learnt: to where larger
+        ones begin, there is no other.
         """
         _, states, informations, gradients = map(np.array, zip(*self.samples, strict=True))
         seconds: Array = np.diff(self.times).astype(np.float64) * 1e-9
         scales: Array = np.stack([self.configured, self.deviations])
-        found = list[_Solved]()
+        start, first, found = (self.start.state, self.start.covariance), 0, list[_Solved]()
         swings = _SWINGS if np.median(seconds) > _SLOW else ()
         for grown, swing in (*((grown, 0.0) for grown in _GROWN), *((1.0, x) for x in swings)):
+            if swing > 0.0:
+                first, start = 0, (self.start.state, self.start.covariance)
             found.append(_Solved(*_solve(
-                seconds, states, informations, gradients, self.start.state, self.start.covariance,
+                seconds[first:], states[first:], informations[first:], gradients[first:], *start,
                 scales, self.readout_share, 0 if found else rounds, smooths, grown, swing,
             )))  # fmt: skip
-            scales = np.stack([self.configured, found[0].deviations])
+            if len(found) == 1:
+                learnt, scales = found[0], np.stack([self.configured, found[0].deviations])
+                if not smooths:
+                    first = max(len(seconds) - _RECENT, 0)
+                    start = learnt.states[first], learnt.covariances[first]
+            else:
+                found[-1] = found[-1]._replace(
+                    evidences=found[-1].evidences + learnt.evidences[first]
+                )
         return tuple(found)
 
 
@@ -378,7 +389,7 @@ def _solve(
     seconds: Array1, states: Array2, informations: Array3, gradients: Array2, start: Array1,
     start_covariance: Array2, scales: Array2, readout_share: float, rounds: int, smooths: bool,
     grown: float, swing: float,
-) -> tuple[Array, Array, Array, float, float]:  # fmt: skip
+) -> tuple[Array, Array, Array, float, Array]:  # fmt: skip
     """Filter, learn deviations and perhaps smooth: the fields of :class:`_Solved`.
 
     Args:
@@ -394,14 +405,14 @@ def _solve(
     square, row = (count + 1, PARAMETERS, PARAMETERS), (count + 1, STATE_SIZE)
     predicted, filtered = np.empty(row), np.empty(row)
     predictions, transports, knowns = np.empty(square), np.empty(square), np.empty(square)
-    covariances, beside = np.empty(square), 0.0
-    told, pulls = informations, gradients
+    covariances, evidences = np.empty(square), np.zeros(count + 1)
+    told, pulls, beside = informations, gradients, 0.0
     if swing > 0.0:
         informations, gradients = told.copy(), pulls.copy()
         for k in range(count):
             beside += _of_trajectory(informations[k], gradients[k], swing * seconds[k] * configured)
     while True:
-        filtered[0], covariances[0], surprise, evidence = start, start_covariance, 0.0, beside
+        filtered[0], covariances[0], surprise, evidences[0] = start, start_covariance, 0.0, beside
         for k in range(count):
             own = enlarged(deviations, configured, grown if k >= count - _RECENT else 1.0)
             predicted[k], predictions[k], transports[k] = _predicted(
@@ -415,7 +426,7 @@ def _solve(
             moved = step_between(predicted[k], filtered[k + 1])
             surprise = np.sum(moved * (known @ moved))
             surprise += np.sum(step * (informations[k] @ step - 2.0 * gradients[k]))
-            evidence -= narrower + left + 0.5 * surprise
+            evidences[k + 1] = evidences[k] - (narrower + left + 0.5 * surprise)
         if rounds == 0 and not smooths:
             break
         scores, weight = np.zeros((4, 3)), 1.0
@@ -444,7 +455,7 @@ def _solve(
         step = kept @ step_between(states[k], filtered[k + 1]) + spread @ pulls[k]
         filtered[k + 1] = apply_step(states[k], step)
         covariances[k + 1] = kept @ covariances[k + 1] @ kept.T + spread
-    return filtered, covariances, deviations, surprise, evidence
+    return filtered, covariances, deviations, surprise, evidences
 
 
 @kernel

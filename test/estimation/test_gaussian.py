@@ -7,9 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.state import step_between
+from rs_localizer.estimation import gaussian
 from rs_localizer.estimation.gaussian import (
     Frame,
     Gaussians,
+    Mode,
     along_arcs,
     linear_at,
     mixture,
@@ -207,3 +209,26 @@ def test_leans_are_integrated_as_on_a_fine_grid(tilt, noise):
     square, volume = beside(points, pixels, rotation, translation, np.vstack([normal, across]))
     one = volume - 0.5 * freedom * np.log(square) + 2.0 * np.log(best.noise)
     assert found.evidence - mode.evidence == pytest.approx(whole - one, abs=0.1)
+
+
+@pytest.mark.parametrize(("third", "fourth"), [(0.0, 0.1), (0.1, 0.0), (-0.05, 0.05)])
+def test_a_lean_that_is_nearly_gaussian_has_the_moments_of_its_orders(third, fourth, as_python):
+    """Against quadrature: by how much the evidence falls 1.5 deviations beside the mode."""
+    deviation, axis = 0.05, np.array([0.0, 0.6, 0.8])
+    covariance = np.diag(np.r_[np.full(3, 1e-4), np.full(15, 1.0)])
+    covariance[:3, :3] += (deviation**2 - 1e-4) * np.outer(axis, axis)
+    state = np.concatenate([np.eye(3).ravel(), np.zeros(15)])
+    mode = Mode(state, covariance, 0.0, 1.0, 1.0, 0.0, 30.0)
+    falls = 1.0 - np.array([[fourth + third, fourth - third]])
+    found = as_python(gaussian._bent_by)(mode, axis[None], falls, 0.0)
+    z = np.linspace(-4.0, 4.0, 2001)
+    orders = third * z**3 / 3.0 + fourth * z**4 / 4.5 * (np.abs(z) < 3.0)
+    weights = np.exp(orders - 0.5 * z**2)
+    mean = weights @ z / weights.sum()
+    variance = weights @ (z - mean) ** 2 / weights.sum()
+    turned = Rotation.from_matrix(found.states[0, :9].reshape(3, 3)).as_rotvec()
+    assert -axis @ turned / deviation == pytest.approx(mean, abs=0.02)
+    own = axis @ found.covariances[0, :3, :3] @ axis / deviation**2
+    assert own == pytest.approx(variance, abs=0.03)
+    evidence = np.log(weights.sum() * (z[1] - z[0]) / np.sqrt(2.0 * np.pi))
+    assert found.evidences[0] == pytest.approx(evidence, abs=0.02)

@@ -22,6 +22,7 @@ from rs_localizer.estimation.linear_fit import (
     TurnPrior,
     bend_of,
     fit,
+    hidden,
     known_at,
     linear_of,
     marginal,
@@ -185,6 +186,11 @@ def test_vibration_is_integrated_as_over_dense_matrices():
     # Pose and velocities; what truncated combinations lose of accelerations is not asked for.
     poses = expected[:12, :12]
     alike(shown[:12, :12], poses, np.sqrt(np.diag(poses)), atol=0.05)
+    gain, hiding, _ = hidden(
+        lines, np.ones(40, bool), shared, known, noise, freedom, math.inf, VIBRATION
+    )
+    assert gain == pytest.approx(found.gain, abs=1e-9)
+    alike(hiding, shown[:12, :12], np.sqrt(np.diag(poses)), atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["turn", SHARED])
