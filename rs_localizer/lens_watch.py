@@ -55,8 +55,7 @@ class LensWatch:
 
     def __init__(self, exposure: Exposure | None, config: LocalizerConfig) -> None:
         self._least = _OF_DISTORTION * config.calibration.distortion
-        self._exposure, self._threshold = exposure, config.inlier_threshold
-        self._config = config
+        self._exposure, self._config = exposure, config
         self.reset()
 
     def reset(self) -> None:
@@ -92,6 +91,11 @@ class LensWatch:
                 return str(matrix)
         others = [text for text in self._others if text]
         return others[-1] if len(others) >= _OTHERS else ""
+
+    @property
+    def doubted(self) -> bool:
+        """Whether K may be that of another camera."""
+        return bool(self.refusal or (self._together and self._together.doubt.any()))
 
     @property
     def calibration(self) -> CalibrationErrors:
@@ -145,8 +149,6 @@ class LensWatch:
             self._others.append(found.detail if found.reason is Reason.CALIBRATION else "")
             return
         self._others.append("")
-        if found.residual_rms > self._threshold:  # of errors that nobody knows
-            self._posed.clear()
         self._compare(Fitted(time_ns, found, points, pixels))
         if len(found.shake):  # vibration moves points smoothly, too
             return

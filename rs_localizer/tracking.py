@@ -210,6 +210,8 @@ class Tracker:
         only.
         """
         newest = self._seen[-1].found if self._seen else None
+        if self.lens.doubted:  # another camera shows all of the map elsewhere
+            return None
         return self._parts.named if newest and self.lens.is_beyond(newest) else None
 
     def mount(self, rig: Rig) -> None:
@@ -447,7 +449,8 @@ class Tracker:
             jumped = self._has_jumped(time_ns, prior, result)
             seen = np.asarray(points, float), np.asarray(pixels, float)
             self.lens.add(time_ns, result, *seen, jumped=jumped)
-            self._allow(self.lens.calibration)
+            if self._allow(self.lens.calibration) and result:  # this frame shows it, too
+                result = find(prior, foreseen.rotation if foreseen and result.aided else None)
             if self.lens.matrix is None:
                 self.shutter.add(time_ns, result, *seen, jumped=jumped)
             doubtful = self.shutter.error or not self.shutter.trusted
@@ -466,12 +469,14 @@ class Tracker:
         self._publish()
         return self.delayed
 
-    def _allow(self, calibration: CalibrationErrors) -> None:
-        """Let the next frames have these deviations."""
-        self._allowing = self.localizer
+    def _allow(self, calibration: CalibrationErrors) -> bool:
+        """Let the next frames have these deviations; return whether one is larger than before."""
+        before, self._allowing = self._allowing.config.calibration, self.localizer
         if calibration != self.localizer.config.calibration:
             self._allowing = copy(self.localizer)
             self._allowing.config = replace(self.localizer.config, calibration=calibration)
+        length, aspect = calibration.focal_length, calibration.aspect_ratio
+        return length > before.focal_length or aspect > before.aspect_ratio
 
     def _fitted(
         self, time_ns: int, foreseen: Foretold | None, span: float | None,

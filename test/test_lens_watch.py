@@ -157,6 +157,23 @@ def test_a_map_that_is_longer_one_way_moves_as_frames_tell(angle, surely):
         assert abs(way @ along) > 0.98
 
 
+def test_a_wrong_lens_before_a_wall_is_no_part_of_it_that_moved():
+    """Frames leave 3 px, as of errors that nobody knows, and looked like a part that moved."""
+    random = np.random.default_rng(1)
+    camera = camera_of(TRUE)
+    K = camera.K * [[0.8, 1.0, 1.0], [1.0, 0.8, 1.0], [1.0, 1.0, 1.0]]
+    tracker = Tracker(rsl.Localizer(replace(camera, K=K)))
+    wall = np.column_stack([random.uniform(-1.0, 1.0, (60, 2)) * [1.1, 0.7], np.zeros(60)])
+    moved, said = np.r_[0.0, 0.0, 2.0, 0.4, 0.3, 0.0, 0.4, 0.2, 0.1, 0.05, 0.2, 0.1], []
+    for k in range(24):
+        pixels = moving_board(wall, moved, k / 30 - 0.4)
+        pixels += random.normal(0.0, 0.3, pixels.shape)
+        tracker.localize(10**12 + 33_333_333 * k, wall, pixels)
+        assert tracker.moved is None
+        said.append(tracker.lens.fault)
+    assert all("a focal length 1.2" in each for each in said[8:]), said
+
+
 def test_poses_allow_for_a_focal_length_that_frames_doubt():
     """A board of 0.5 m that the camera faces is as much farther away as its focal length is."""
     random = np.random.default_rng(1)

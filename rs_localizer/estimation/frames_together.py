@@ -48,8 +48,6 @@ _KEPT, _KNOWN = 8, 0.02
 _ROUNDS, _LEAST_STEP, _NEAR = 8, 1e-3, (0.3, 0.05, 0.02)
 _EXACT_ROUNDS = 5  # of all threes, three of which are enough before ceilings
 _LEAST_NOISE = 0.1  # px, no real error is smaller
-# So many threes in a row that do not fit those before are no chance.
-_ODD = 2
 # Focal lengths from which the search also starts, over K's.
 _LENGTHS = (0.6, 1.7)
 # The largest step of a number: beyond it the linear terms no longer hold; usual steps of the first
@@ -377,13 +375,14 @@ class FramesTogether:
     def __init__(self, exposure: Exposure, config: LocalizerConfig) -> None:
         given = config.calibration
         self._exposure, self._map_deviation = exposure, config.map_deviation
+        self._most_variance = config.inlier_threshold**2
         self._of_lens = given.principal_point, given.principal_point, given.distortion
         usual = math.hypot(_USUAL, given.focal_length), max(given.aspect_ratio, _EXACT)
         self._usual = np.array(usual)
         self._threes: list[_Three] = []
         self._map: _Landmarks | None = None
         self._known = np.zeros(_SHARED)  # before any frame, as information
-        self._principal, self._odd = np.zeros(2), 0
+        self._principal = np.zeros(2)
         self._fit: _Fit | None = None
         self.matrix: Matrix | None = None
         """The matrix that frames tell to be the camera's instead of K; None: K may be right."""
@@ -410,13 +409,9 @@ class FramesTogether:
         threes, principal = [*map(copy, self._threes), newest], self._principal
         fit = self._fitted(threes, before, principal)
         if not self._fits(fit, threes):
-            self._odd += 1
-            if self._threes and self._odd < _ODD:  # by chance
-                return
             fit, threes, principal = self._from_anywhere([three.posed for three in threes])
-            if not (threes and self._fits(fit, threes)):  # it leaves more than frames do
+            if not self._fits(fit, threes):  # it leaves more than frames do
                 return
-        self._odd = 0
         if self._beyond(fit, _DOUBTFULLY).any():
             fit, threes, principal = self._beside_k(fit, threes, principal)
         self._threes, self._fit, self._principal = threes, fit, principal
@@ -482,8 +477,13 @@ class FramesTogether:
         return best
 
     def _fits(self, fit: _Fit, threes: Sequence[_Three]) -> bool:
-        """Return whether no more is left than frames leave, and no lens or map is impossible."""
+        """Return whether no more is left than frames leave, and no lens or map is impossible.
+
+        Frames that leave more than points may have errors that nobody knows, unless together they
+        leave less.
+        """
         own = float(np.median([three.variance for three in threes]))
+        own = min(own, self._most_variance)
         squared = (fit.numbers**2 * self._known)[_LENS.start :]
         near = fit.variance < _AS_GOOD * max(own, self._least_variance(threes))
         return bool(near and squared.max() < _SURELY**2)
