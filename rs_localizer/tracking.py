@@ -449,8 +449,7 @@ class Tracker:
             jumped = self._has_jumped(time_ns, prior, result)
             seen = np.asarray(points, float), np.asarray(pixels, float)
             self.lens.add(time_ns, result, *seen, jumped=jumped)
-            if self._allow(self.lens.calibration) and result:  # this frame shows it, too
-                result = find(prior, foreseen.rotation if foreseen and result.aided else None)
+            self._allow(self.lens.calibration)
             if self.lens.matrix is None:
                 self.shutter.add(time_ns, result, *seen, jumped=jumped)
             doubtful = self.shutter.error or not self.shutter.trusted
@@ -459,7 +458,7 @@ class Tracker:
         if result:
             result = self._judged(time_ns, result, points, prior)
             if pixels is not None:
-                result = self.lens.widened(result, seen[0])
+                result = self.lens.widened(result, *seen)
             result = self.shutter.widened(result)
             if self.remembers_motion:
                 result = self._covering(replace(result, time_ns=time_ns), context)
@@ -469,14 +468,12 @@ class Tracker:
         self._publish()
         return self.delayed
 
-    def _allow(self, calibration: CalibrationErrors) -> bool:
-        """Let the next frames have these deviations; return whether one is larger than before."""
-        before, self._allowing = self._allowing.config.calibration, self.localizer
+    def _allow(self, calibration: CalibrationErrors) -> None:
+        """Let the next frames have these deviations."""
+        self._allowing = self.localizer
         if calibration != self.localizer.config.calibration:
             self._allowing = copy(self.localizer)
             self._allowing.config = replace(self.localizer.config, calibration=calibration)
-        length, aspect = calibration.focal_length, calibration.aspect_ratio
-        return length > before.focal_length or aspect > before.aspect_ratio
 
     def _fitted(
         self, time_ns: int, foreseen: Foretold | None, span: float | None,

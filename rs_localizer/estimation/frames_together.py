@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -27,6 +28,7 @@ import numpy as np
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import centre_of
 from rs_localizer.core.rig import Exposure
 from rs_localizer.core.state import MOVE, VELOCITIES
@@ -390,6 +392,8 @@ class FramesTogether:
         """How frames show the map to be stretched; None: by no more than chance."""
         self.doubt = np.zeros(2)
         """Deviations (logarithms) of focal length and fy over fx from K's, if frames doubt K."""
+        self.other: tuple[Camera, Array] | None = None
+        """The camera that frames then tell, and deviations (2,) of these numbers of it."""
 
     @property
     def is_enough(self) -> bool:
@@ -420,8 +424,10 @@ class FramesTogether:
         told = self._beyond(fit, _SURELY, _VIBRATING) > 0.0
         ratios = np.where(told, np.exp(fit.numbers[_OF_K]), 1.0)
         self.matrix = Matrix(*ratios.tolist()) if told.any() else None
-        off = np.hypot(fit.numbers[_OF_K], fit.deviations[_OF_K])
-        self.doubt = np.where(self._beyond(fit, _DOUBTFULLY) > 0.0, off, 0.0)
+        doubtful = self._beyond(fit, _DOUBTFULLY) > 0.0
+        numbers, deviations = (doubtful * each[_OF_K] for each in (fit.numbers, fit.deviations))
+        self.doubt = np.hypot(numbers, deviations)
+        self.other = (self._another(*numbers), deviations) if doubtful.any() else None
         sizes, deviations = fit.numbers[_STRETCHED], fit.deviations[_STRETCHED]
         by_more = np.sqrt(np.maximum(sizes**2 - deviations**2, 0.0))
         # Frames that do not tell the readout time are not of the motion between them, or at rest.
@@ -429,6 +435,14 @@ class FramesTogether:
         surely &= bool(fit.deviations[_READOUT] < _TURNED)
         stretch = Stretch(self._map, np.copysign(by_more, sizes), surely)
         self.stretch = stretch if by_more.any() else None
+
+    def _another(self, length: float, aspect: float) -> Camera:
+        """Return the camera with another focal length and fy over fx (logarithms, over K's)."""
+        (camera,) = self._exposure.cameras
+        K = camera.K.copy()
+        K[[0, 1], [0, 1]] *= np.exp(length + aspect * _ASPECT)
+        K[:2, 2] += math.expm1(length) * self._principal * camera.focal_length
+        return replace(camera, K=K)
 
     def _beyond(self, fit: _Fit, least: float, wider: float = 1.0) -> Array:
         """Return what of focal length and fy over fx (2,) lies beyond so many deviations, or 0."""
