@@ -18,14 +18,17 @@ from dataclasses import replace
 import numpy as np
 
 from rs_localizer.config import CalibrationErrors, LocalizerConfig
+from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure
 from rs_localizer.core.scanning import VERTICAL
-from rs_localizer.core.state import ANGULAR, LINEAR
+from rs_localizer.core.state import ANGULAR, LINEAR, PARAMETERS, POSE, VELOCITIES
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import ErrorModes, LandmarkErrors
 from rs_localizer.estimation.frames_together import FRAMES, Fitted, FramesTogether, Matrix
+from rs_localizer.estimation.prior import predicted
+from rs_localizer.localizer import Localizer
 
 # Frames of which the median counts.
 _FRAMES = 15
@@ -56,8 +59,7 @@ class LensWatch:
 
     def __init__(self, exposure: Exposure | None, config: LocalizerConfig) -> None:
         self._least = _OF_DISTORTION * config.calibration.distortion
-        self._exposure, self._threshold = exposure, config.inlier_threshold
-        self._config = config
+        self._exposure, self._config = exposure, config
         self.reset()
 
     def reset(self) -> None:
@@ -67,6 +69,7 @@ class LensWatch:
         self._others: deque[str] = deque(maxlen=_OF_THE_LAST)
         self._posed: deque[Fitted] = deque(maxlen=FRAMES)
         self._together: FramesTogether | None = None
+        self._other: Localizer | None = None  # with the matrix that frames tell, if they doubt K
         if self._exposure is not None:
             self._together = FramesTogether(self._exposure, self._config)
         self._count, self._next, self._jumped = 0, FRAMES, False
@@ -95,14 +98,18 @@ class LensWatch:
         return others[-1] if len(others) >= _OTHERS else ""
 
     @property
+    def doubted(self) -> bool:
+        """Whether K may be that of another camera."""
+        return bool(self.refusal or (self._together and self._together.doubt.any()))
+
+    @property
     def calibration(self) -> CalibrationErrors:
-        """Deviations that allow for a camera matrix that frames doubt."""
+        """Deviations that allow for what frames do not tell of another matrix, if they doubt K."""
         given = self._config.calibration
-        if self._together is None or not self._together.doubt.any():
+        if self._together is None or self._together.other is None:
             return given
-        length, aspect = np.hypot(
-            self._together.doubt, [given.focal_length, given.aspect_ratio]
-        ).tolist()
+        _, deviations = self._together.other
+        length, aspect = np.hypot(deviations, [given.focal_length, given.aspect_ratio]).tolist()
         return replace(given, focal_length=min(length, 1.0), aspect_ratio=min(aspect, 1.0))
 
     def errors_of(self, declared: ErrorModes | None) -> LandmarkErrors | None:
@@ -110,16 +117,18 @@ class LensWatch:
         stretch = None if self._together is None else self._together.stretch
         return declared if stretch is None else stretch._replace(beside=declared)
 
-    def widened(self, found: Estimate, points: Array) -> Estimate:
-        """Return a frame whose velocities allow for another camera matrix, if frames doubt K.
+    def widened(self, found: Estimate, points: Array, pixels: Array) -> Estimate:
+        """Return a frame that allows for another camera matrix, if frames doubt K.
 
-        A wrong focal length scales the distance of a board, its tilt and all ways by one share, and
-        so it does linear and angular velocities. A camera whose fy over fx is off by ``s`` reads
-        that as a pitch rate of ``s`` times the height over the focal length.
+        The pose that the other matrix gives is one deviation away. A wrong focal length scales the
+        distance of a board, its tilt and all ways by one share, and so it does linear and angular
+        velocities. A camera whose fy over fx is off by ``s`` reads that as a pitch rate of ``s``
+        times the height over the focal length.
         """
-        if self._exposure is None or self._together is None or not self._together.doubt.any():
+        if not (self._other and self._exposure and self._together) or self.refusal:
             return found
-        (camera,), (length, aspect) = self._exposure.cameras, self._together.doubt.tolist()
+        camera, (length, aspect) = self._other.camera, self._together.doubt.tolist()
+        (given,) = self._exposure.cameras
         axis = int(camera.scan_direction not in VERTICAL)
         depth = float(np.median(points @ found.rotation[2])) + found.translation[2]
         rate, speed = map(np.linalg.norm, (found.angular_velocity, found.linear_velocity))
@@ -129,6 +138,18 @@ class LensWatch:
             aspect * camera.size[1 - axis] / camera.focal_length
         ) ** 2
         calibration[LINEAR, LINEAR] += length**2 * (speed**2 + (depth * rate) ** 2) * np.eye(3)
+        # Near that, with velocities as they are known, and any pose.
+        covariance = found.joint_covariance[:PARAMETERS, :PARAMETERS].copy()
+        covariance[VELOCITIES, VELOCITIES] += calibration[VELOCITIES, VELOCITIES]
+        covariance[POSE] = covariance[:, POSE] = 0.0
+        np.fill_diagonal(covariance[POSE, POSE], np.inf)
+        away = depth * (camera.focal_length / given.focal_length - 1.0)
+        motion = replace(found, translation=found.translation + np.array([0.0, 0.0, away]))
+        there = self._other.find(points, pixels, prior=predicted(motion, covariance))
+        if there:
+            turn = so3.log(np.ascontiguousarray(found.rotation @ there.rotation.T))
+            off = np.r_[turn, found.rotation @ (there.position - found.position)]
+            calibration[POSE, POSE] += np.outer(off, off)
         return replace(found, calibration_covariance=calibration)
 
     def add(
@@ -146,8 +167,6 @@ class LensWatch:
             self._others.append(found.detail if found.reason is Reason.CALIBRATION else "")
             return
         self._others.append("")
-        if found.residual_rms > self._threshold:  # of errors that nobody knows
-            self._posed.clear()
         self._compare(Fitted(time_ns, found, points, pixels))
         if len(found.shake):  # vibration moves points smoothly, too
             return
@@ -177,6 +196,8 @@ class LensWatch:
         if len(self._posed) < FRAMES or self._count < self._next:
             return
         self._together.add(list(self._posed))
+        other = self._together.other
+        self._other = None if other is None else Localizer(other[0], self._config)
         if self._together.is_enough:
             self._next = self._count + min(self._count, _RARELY)
         else:

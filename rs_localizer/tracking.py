@@ -210,6 +210,8 @@ class Tracker:
         only.
         """
         newest = self._seen[-1].found if self._seen else None
+        if self.lens.doubted:  # another camera shows all of the map elsewhere
+            return None
         return self._parts.named if newest and self.lens.is_beyond(newest) else None
 
     def mount(self, rig: Rig) -> None:
@@ -460,7 +462,7 @@ class Tracker:
         if result:
             result = self._judged(time_ns, result, points, prior)
             if pixels is not None:
-                result = self.lens.widened(result, seen[0])
+                result = self.lens.widened(result, *seen)
             result = self.shutter.widened(result)
             if self.remembers_motion:
                 result = self._covering(replace(result, time_ns=time_ns), context)

@@ -35,7 +35,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "localizer": {"core", "config", "solvers", "estimation"},
     "integrity": {"core", "config", "estimation", "native"},
     "repeated_images": {"core", "estimation"},
-    "lens_watch": {"core", "config", "estimation"},
+    "lens_watch": {"core", "config", "estimation", "localizer"},
     "shutter_watch": {"core", "estimation", "native"},
     "tracking": METHOD - {"tracking", "inertial"},
     "io": {"core"},

@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -27,6 +28,7 @@ import numpy as np
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, Array1, Array2, Array3, IntArray1
+from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import centre_of
 from rs_localizer.core.rig import Exposure, Mounts
 from rs_localizer.core.state import MOVE, PARAMETERS, STATE_ANGULAR, STATE_LINEAR, VELOCITIES
@@ -50,8 +52,6 @@ _ROUNDS, _LEAST_STEP, _NEAR = 8, 1e-3, (0.3, 0.05, 0.02)
 _EXACT_ROUNDS = 5  # of all threes, three of which are enough before ceilings
 _LEAST_NOISE = 0.1  # px, no real error is smaller
 _OF_MEDIAN = 1.386  # median of the squared errors of a point, over the variance of a coordinate
-# So many threes in a row that do not fit those before are no chance.
-_ODD = 2
 # Focal lengths from which the search also starts, over K's.
 _LENGTHS = (0.6, 1.7)
 # The largest step of a number: beyond it the linear terms no longer hold; usual steps of the first
@@ -423,13 +423,14 @@ class FramesTogether:
     def __init__(self, exposure: Exposure, config: LocalizerConfig) -> None:
         given = config.calibration
         self._exposure, self._map_deviation = exposure, config.map_deviation
+        self._most_variance = config.inlier_threshold**2
         self._of_lens = given.principal_point, given.principal_point, given.distortion
         usual = math.hypot(_USUAL, given.focal_length), max(given.aspect_ratio, _EXACT)
         self._usual = np.array(usual)
         self._threes: list[_Three] = []
         self._map: _Landmarks | None = None
         self._known = np.zeros(_SHARED)  # before any frame, as information
-        self._principal, self._odd = np.zeros(2), 0
+        self._principal = np.zeros(2)
         self._fit: _Fit | None = None
         self.matrix: Matrix | None = None
         """The matrix that frames tell to be the camera's instead of K; None: K may be right."""
@@ -437,6 +438,8 @@ class FramesTogether:
         """How frames show the map to be stretched; None: by no more than chance."""
         self.doubt = np.zeros(2)
         """Deviations (logarithms) of focal length and fy over fx from K's, if frames doubt K."""
+        self.other: tuple[Camera, Array] | None = None
+        """The camera that frames then tell, and deviations (2,) of these numbers of it."""
 
     @property
     def is_enough(self) -> bool:
@@ -456,13 +459,9 @@ class FramesTogether:
         threes, principal = [*map(copy, self._threes), newest], self._principal
         fit = self._fitted(threes, before, principal)
         if not self._fits(fit, threes):
-            self._odd += 1
-            if self._threes and self._odd < _ODD:  # by chance
-                return
             fit, threes, principal = self._from_anywhere([three.posed for three in threes])
-            if not (threes and self._fits(fit, threes)):  # it leaves more than frames do
+            if not self._fits(fit, threes):  # it leaves more than frames do
                 return
-        self._odd = 0
         if self._beyond(fit, _DOUBTFULLY).any():
             fit, threes, principal = self._beside_k(fit, threes, principal)
         self._threes, self._fit, self._principal = threes, fit, principal
@@ -471,8 +470,10 @@ class FramesTogether:
         told = self._beyond(fit, _SURELY, _VIBRATING) > 0.0
         ratios = np.where(told, np.exp(fit.numbers[_OF_K]), 1.0)
         self.matrix = Matrix(*ratios.tolist()) if told.any() else None
-        off = np.hypot(fit.numbers[_OF_K], fit.deviations[_OF_K])
-        self.doubt = np.where(self._beyond(fit, _DOUBTFULLY) > 0.0, off, 0.0)
+        doubtful = self._beyond(fit, _DOUBTFULLY) > 0.0
+        numbers, deviations = (doubtful * each[_OF_K] for each in (fit.numbers, fit.deviations))
+        self.doubt = np.hypot(numbers, deviations)
+        self.other = (self._another(*numbers), deviations) if doubtful.any() else None
         sizes, deviations = fit.numbers[_STRETCHED], fit.deviations[_STRETCHED]
         by_more = np.sqrt(np.maximum(sizes**2 - deviations**2, 0.0))
         # Frames that do not tell the readout time are not of the motion between them, or at rest.
@@ -480,6 +481,14 @@ class FramesTogether:
         surely &= bool(fit.deviations[_READOUT] < _TURNED)
         stretch = Stretch(self._map, np.copysign(by_more, sizes), surely)
         self.stretch = stretch if by_more.any() else None
+
+    def _another(self, length: float, aspect: float) -> Camera:
+        """Return the camera with another focal length and fy over fx (logarithms, over K's)."""
+        (camera,) = self._exposure.cameras
+        K = camera.K.copy()
+        K[[0, 1], [0, 1]] *= np.exp(length + aspect * _ASPECT)
+        K[:2, 2] += math.expm1(length) * self._principal * camera.focal_length
+        return replace(camera, K=K)
 
     def _beyond(self, fit: _Fit, least: float, wider: float = 1.0) -> Array:
         """Return what of focal length and fy over fx (2,) lies beyond so many deviations, or 0."""
@@ -528,8 +537,13 @@ class FramesTogether:
         return best
 
     def _fits(self, fit: _Fit, threes: Sequence[_Three]) -> bool:
-        """Return whether no more is left than frames leave, and no lens or map is impossible."""
+        """Return whether no more is left than frames leave, and no lens or map is impossible.
+
+        Frames that leave more than points may have errors that nobody knows, unless together they
+        leave less.
+        """
         own = float(np.median([three.variance for three in threes]))
+        own = min(own, self._most_variance)
         squared = (fit.numbers**2 * self._known)[_LENS.start :]
         near = fit.variance < _AS_GOOD * max(own, self._least_variance(threes))
         return bool(near and squared.max() < _SURELY**2)

@@ -51,6 +51,8 @@ _ALONG = np.array([
 _OF_SHIFT = 2
 # Rounds of labels and fits: they mostly agree after four.
 _ROUNDS = 4
+# Logarithms of both focal lengths, which may be another camera's: no part moves as that shows it.
+_OTHER_LENGTH, _BESIDE = 0.5, PARAMETERS + 2
 # Weights that make one number of a landmark's place, which no other place shares.
 _KEY = np.sqrt([2.0, 3.0, 5.0])
 # Of diagonals of normal equations, so that rounding leaves them positive.
@@ -100,7 +102,8 @@ def look_at(observed: Observed, posterior: Posterior, terms: PriorTerms) -> Look
     by_motion = lines.by_motion[near]
     bend = posterior.bend[near] if posterior.bend.shape[1] else np.zeros((len(by_motion), 0))
     smooth = smooth_columns(by_motion, lines.image[near], bend)
-    columns = np.concatenate([by_motion[:, :, :PARAMETERS], smooth], axis=2)
+    of_lens = seen.by_ray[near] * (lines.image[near, None, :] * _OTHER_LENGTH)
+    columns = np.concatenate([by_motion[:, :, :PARAMETERS], of_lens, smooth], axis=2)
     prior, motion = variance * np.eye(columns.shape[2]), slice(0, PARAMETERS)
     prior[motion, motion] = variance * known_at(terms, posterior.state).form[motion, motion]
     by_place = -by_motion[:, :, MOVE] @ rotation_of(posterior.state)
@@ -260,7 +263,7 @@ class _Frames(NamedTuple):
             shown[k, own], inliers[k, own] = True, look.inliers[here]
             for prior, size in zip(priors[:, k], look.sizes, strict=True):
                 scale = np.ones(taken)
-                scale[PARAMETERS:] = max(size, LEAST_NOISE)
+                scale[_BESIDE:] = max(size, LEAST_NOISE)
                 prior[:taken, :taken] = look.prior / np.outer(scale, scale)
         reach, area = np.array([(look.reach, look.area) for look in looks]).T[:, :, None]
         return cls(points[first[some]], rows, columns, priors, shown, inliers, reach, area)
