@@ -64,6 +64,7 @@ class Row(NamedTuple):
     matcher: str
     wrong: bool
     numbers: Array
+    seconds: float  # since the last one
 
 
 def changed(kind: str, world: Array, rng: np.random.Generator) -> Array:
@@ -221,7 +222,7 @@ def sequence(number: int, kinds: Sequence[str] = KINDS, scene: str = "whole") ->
         share = float(np.mean(np.any(np.abs(seen - world[ids]) > 1e-9, axis=1)))
         if kind in RIGID and share > 0.95:
             continue
-        rows.append(Row((scene, number), kind, matcher, bool(outside), numbers))
+        rows.append(Row((scene, number), kind, matcher, bool(outside), numbers, seconds))
     return rows
 
 
@@ -232,7 +233,7 @@ def recursive(rows: list[Row]) -> Array:
         if row.sequence != last:
             judge.reset()
             last = row.sequence
-        found.append(judge.add(row.numbers))
+        found.append(judge.add(row.numbers, row.seconds))
     return np.array(found)
 
 

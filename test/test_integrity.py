@@ -34,7 +34,8 @@ def estimate(kept: Any, tracked: bool = True) -> Estimate:
 def run(frames: int, kept: Any, prior: Prior | None = None) -> list[float]:
     judge, doubts = Integrity(Acceleration()), []
     for i in range(frames):
-        doubts.append(judge.add(judge.numbers(estimate(kept(), i > 0), POINTS, prior, FRAME)))
+        numbers = judge.numbers(estimate(kept(), i > 0), POINTS, prior, FRAME)
+        doubts.append(judge.add(numbers, FRAME))
     return doubts
 
 
@@ -59,13 +60,13 @@ def test_chance_outliers_are_no_doubt_and_a_part_that_fits_alone_is():
 def test_doubt_falls_again():
     judge = Integrity(Acceleration())
     doubts = [
-        judge.add(judge.numbers(estimate(kept), POINTS, None, FRAME))
+        judge.add(judge.numbers(estimate(kept), POINTS, None, FRAME), FRAME)
         for kept in (*(near() for _ in range(10)), *(anywhere() for _ in range(15)))
     ]
     assert doubts[9] > 0.2
     assert doubts[-1] < 0.05
     judge.reset()
-    assert judge.add(judge.numbers(estimate(anywhere()), POINTS, None, FRAME)) < 0.1
+    assert judge.add(judge.numbers(estimate(anywhere()), POINTS, None, FRAME), FRAME) < 0.1
 
 
 def jumping(unseen: float) -> list[float]:
@@ -77,7 +78,7 @@ def jumping(unseen: float) -> list[float]:
         motion = Motion(np.eye(3), aside, np.zeros(3), np.zeros(3))
         prior = Prior(motion=motion, covariance=1e-4 * np.eye(12))
         seen = estimate(anywhere(), i > 0), POINTS, prior, unseen if jumps else FRAME
-        doubts.append(judge.add(judge.numbers(*seen)))
+        doubts.append(judge.add(judge.numbers(*seen), seen[-1]))
     return doubts
 
 
