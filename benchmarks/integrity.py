@@ -289,10 +289,13 @@ def fit(rows: list[Row]) -> None:
     found = _regression(numbers[:, own], wrong, 0.5, 0.05)
     innovations, jumped = _jumps(rows)
     jump = _regression(innovations[:, None], jumped, 0.002, 0.0)
+    after = [b for a, b in itertools.pairwise(rows) if a.sequence == b.sequence and a.wrong]
+    returned = sum(not row.wrong for row in after)
+    integrity.RETURNS = returned / sum(row.seconds for row in after)
     wrong, best = np.array([row.wrong for row in rows]), (np.inf, 0.0, 0.0, 0.0, integrity.JUMP)
     share = weights_of(wrong)
     for more, temper, recovers, odds in itertools.product(
-        (0.0, 0.5, 1.0), (0.3, 0.4, 0.6), (0.2, 0.4, 0.6), (integrity.JUMP, tuple(jump))
+        (0.0, 0.5, 1.0), (0.3, 0.4, 0.6), (3.3, 7.7, 13.7), (integrity.JUMP, tuple(jump))
     ):
         tried = more, temper, recovers, odds
         _use(found, *tried)
@@ -301,7 +304,7 @@ def fit(rows: list[Row]) -> None:
         best = min(best, (cost, *tried))
     _use(found, *best[1:])
     print("WEIGHTS", np.round(integrity.WEIGHTS, 3).tolist(), "JUMP", np.round(integrity.JUMP, 2))
-    print("TEMPER, RECOVERS", best[2:4])
+    print("TEMPER, RECOVERS", best[2:4], f"RETURNS {integrity.RETURNS:.2f}")
 
 
 def _use(

@@ -90,6 +90,20 @@ def test_a_pose_that_jumps_is_doubted_until_it_jumps_back():
     assert doubts[31] < doubts[29]
 
 
+@pytest.mark.parametrize("rate", [10.0, 30.0, 100.0])
+def test_a_camera_that_was_carried_is_doubted_for_a_second_at_any_rate(rate):
+    """One jump, and right images ever since; before it nothing, however often images come."""
+    judge = Integrity(Acceleration())
+    right = np.array([0.0, 0.0, 4.0, 0.0])  # nothing clusters, all of the map, sixty points
+    jump = right + np.array([0.0, 0.0, 0.0, 5.0])
+    before = [judge.add(right, 1.0 / rate) for _ in range(round(3.0 * rate))]
+    doubts = [judge.add(jump, 1.0 / rate)]
+    doubts += [judge.add(right, 1.0 / rate) for _ in range(round(3.0 * rate))]
+    assert max(before[-10:]) < 0.01
+    assert 0.6 < np.sum(np.array(doubts) > 0.5) / rate < 1.2
+    assert doubts[-1] < 0.35
+
+
 def test_a_hand_that_was_out_of_sight_has_not_jumped():
     """In 0.7 s it moves by half a metre at 2 m/s^2, of the 4 that settings allow."""
     assert max(jumping(0.7)) < 0.05
