@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a gyroscope has, in words.
+"""Words for a gyroscope that is off.
 
 While it is used, the track's numbers tell it. A gyroscope that images contradict is not near any
 numbers: its turns between images, beside the camera's, tell a matrix of it by least squares,
