@@ -75,6 +75,7 @@ class ComparedTurns:
     def __init__(self) -> None:
         self._rates: deque[Array] = deque(maxlen=_REMEMBERED)  # (7,) gyroscope, 1, camera; rad/s
         self._last: LastFrame | None = None
+        self._told = ""
 
     def add(self, samples: ImuSamples, last: LastFrame) -> None:
         """Take the turn to the last image; samples reach back to the one before, if it counts."""
@@ -89,22 +90,21 @@ class ComparedTurns:
         self._rates.append(np.array([*shown, 1.0, *so3.log(turn) / seconds]))
 
     def told(self) -> str:
-        """Return what the gyroscope has, in words; empty: they do not tell."""
+        """Return what the gyroscope has, in words, as long as they told it last; empty: nothing."""
         if len(self._rates) < _REMEMBERED // 3:
-            return ""
+            return self._told
         shown, camera = np.split(np.array(self._rates), [4], axis=1)
         shown[:, :3] -= shown[:, :3].mean(axis=0)
         known = shown.T @ shown
         if np.linalg.cond(known) > 1e12:
-            return ""
+            return self._told
         found = np.linalg.solve(known, shown.T @ camera)
         noise = np.mean((camera - shown @ found) ** 2) * np.linalg.inv(known)[:3, :3]
         left, sizes, right = np.linalg.svd(found[:3].T)
-        slower = float(np.exp(np.log(sizes).mean()))
-        if math.sqrt(noise.diagonal().max()) > _MOST_DEVIATION * sizes[-1]:
-            return ""
-        said = [_axes(left @ right), _rates(-math.log(slower))]
-        return " and ".join(filter(None, said))
+        if math.sqrt(noise.diagonal().max()) < _MOST_DEVIATION * sizes[-1]:
+            said = _axes(left @ right), _faster(-float(np.log(sizes).mean()))
+            self._told = " and ".join(filter(None, said))
+        return self._told
 
 
 def _axes(turn: Array) -> str:
@@ -120,7 +120,7 @@ def _axes(turn: Array) -> str:
     return f"the camera's x y z are its {' '.join(axes)}{mirrored}"
 
 
-def _rates(faster: float) -> str:
+def _faster(faster: float) -> str:
     """Say how fast it shows to turn, by the logarithm of the factor."""
     if abs(faster) < _FIFTH:
         return ""
