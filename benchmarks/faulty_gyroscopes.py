@@ -51,6 +51,7 @@ FAULTS: dict[str, Imu] = {
     "half as fast": Imu(scale=0.5),
     "radians as degrees": Imu(scale=180.0 / math.pi),
     "degrees as radians": Imu(scale=math.pi / 180.0),
+    "mount 20 deg": Imu(mount=_mount(20)),
     "mount 30 deg": Imu(mount=_mount(30)),
     "sign of all": Imu(axes=(-1, -2, -3)),
     "sign of y": Imu(axes=(1, -2, 3)),

@@ -324,7 +324,7 @@ class GyroscopeTrack:
         agrees = bool(far <= 1.0)
         self._contradictions.append(not agrees)
         self._age += 1
-        often = sum(self._contradictions) >= _CONTRADICTIONS
+        often = self._contradicted()
         if not agrees:
             self.forget_motion()
             if often and self._age >= _WATCHED:
@@ -334,6 +334,11 @@ class GyroscopeTrack:
         reason = ImuReason.DISAGREES if often else ImuReason.DOUBTED
         self._unused = None if agrees and not often else Unused(reason, self._oddity())
         return self._unused is None
+
+    def _contradicted(self) -> bool:
+        """Return whether images contradict it, or have, and what it is off by is hard to learn."""
+        often = sum(self._contradictions) >= _CONTRADICTIONS
+        return often or (self._former is not None and self._turns.told() != "")
 
     def _learn(self, tied: Array, gain: Array, information: Array, pull: Array) -> None:
         mean = self.errors.mean + tied.T @ gain.T @ pull
@@ -358,7 +363,7 @@ class GyroscopeTrack:
 
     def _oddity(self) -> str:
         """Return in words what it has that the settings hardly allow for; empty: nothing."""
-        if sum(self._contradictions) >= _CONTRADICTIONS:
+        if self._contradicted():
             return self._turns.told()
         return told_by_numbers(self.errors, self._before_all.diagonal(), self._former)
 

@@ -30,8 +30,9 @@ _MOST_DEVIATION = 0.1
 # 99.9 % quantiles of chi-squared of 1 and 3 numbers: what is known to be off by more than the
 # settings allow is named.
 _CERTAIN = {1: 10.83, 3: 16.27}
-# Rates of so many times the camera's are those of another unit, be they a fifth off.
-_DEGREES, _FIFTH = math.degrees(1.0), math.log(1.2)
+# Rates of so many times the camera's are those of another unit. Rates and mounts (rad) that are
+# closer than these to the camera's are learned from frame to frame.
+_DEGREES, _FASTER, _LEANING = math.degrees(1.0), math.log(1.4), 0.25
 
 
 def told_by_numbers(errors: GyroscopeErrors, allowed: Array, before: GyroscopeErrors | None) -> str:
@@ -112,7 +113,7 @@ def _axes(turn: Array) -> str:
     nearest = np.where(np.abs(turn) == np.abs(turn).max(axis=1)[:, None], np.sign(turn), 0.0)
     if np.array_equal(nearest, np.eye(3)):
         angle = so3.log(np.ascontiguousarray(turn))
-        return _mount(angle) if float(np.linalg.norm(angle)) > 2.0 * _MOST_DEVIATION else ""
+        return _mount(angle) if float(np.linalg.norm(angle)) > _LEANING else ""
     if not np.array_equal(nearest @ nearest.T, np.eye(3)):
         return ""
     axes = [("-" if row.sum() < 0.0 else "") + "xyz"[np.abs(row).argmax()] for row in nearest]
@@ -122,8 +123,8 @@ def _axes(turn: Array) -> str:
 
 def _faster(faster: float) -> str:
     """Say how fast it shows to turn, by the logarithm of the factor."""
-    if abs(faster) < _FIFTH:
+    if abs(faster) < _FASTER:
         return ""
-    unit = abs(abs(faster) - math.log(_DEGREES)) < _FIFTH
+    unit = abs(abs(faster) - math.log(_DEGREES)) < _FASTER
     why = "" if not unit else ": degrees, not radians" if faster > 0.0 else ": not degrees"
     return f"it shows {math.exp(faster):.2g} times the camera's rates{why}"
