@@ -48,6 +48,16 @@ FAULTS: dict[str, Imu] = {
     **{f"late {ms} ms": Imu(offset=-1e-3 * ms) for ms in (5, 20, 40)},
     "step 15 ms": Imu(step=0.015),
     "saturated": Imu(limit=0.5),
+    "half as fast": Imu(scale=0.5),
+    "radians as degrees": Imu(scale=180.0 / math.pi),
+    "degrees as radians": Imu(scale=math.pi / 180.0),
+    "mount 20 deg": Imu(mount=_mount(20)),
+    "mount 30 deg": Imu(mount=_mount(30)),
+    "sign of all": Imu(axes=(-1, -2, -3)),
+    "sign of y": Imu(axes=(1, -2, 3)),
+    "turned about z": Imu(axes=(2, -1, 3)),
+    "x and y swapped": Imu(axes=(2, 1, 3)),
+    "camera_link": Imu(axes=(3, -1, -2)),
 }
 _NOISE = 1.0  # px
 _BEGIN = 5  # frames

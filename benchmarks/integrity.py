@@ -64,6 +64,7 @@ class Row(NamedTuple):
     matcher: str
     wrong: bool
     numbers: Array
+    seconds: float  # since the last one
 
 
 def changed(kind: str, world: Array, rng: np.random.Generator) -> Array:
@@ -221,7 +222,7 @@ def sequence(number: int, kinds: Sequence[str] = KINDS, scene: str = "whole") ->
         share = float(np.mean(np.any(np.abs(seen - world[ids]) > 1e-9, axis=1)))
         if kind in RIGID and share > 0.95:
             continue
-        rows.append(Row((scene, number), kind, matcher, bool(outside), numbers))
+        rows.append(Row((scene, number), kind, matcher, bool(outside), numbers, seconds))
     return rows
 
 
@@ -232,7 +233,7 @@ def recursive(rows: list[Row]) -> Array:
         if row.sequence != last:
             judge.reset()
             last = row.sequence
-        found.append(judge.add(row.numbers))
+        found.append(judge.add(row.numbers, row.seconds))
     return np.array(found)
 
 
@@ -288,10 +289,13 @@ def fit(rows: list[Row]) -> None:
     found = _regression(numbers[:, own], wrong, 0.5, 0.05)
     innovations, jumped = _jumps(rows)
     jump = _regression(innovations[:, None], jumped, 0.002, 0.0)
+    after = [b for a, b in itertools.pairwise(rows) if a.sequence == b.sequence and a.wrong]
+    returned = sum(not row.wrong for row in after)
+    integrity.RETURNS = returned / sum(row.seconds for row in after)
     wrong, best = np.array([row.wrong for row in rows]), (np.inf, 0.0, 0.0, 0.0, integrity.JUMP)
     share = weights_of(wrong)
     for more, temper, recovers, odds in itertools.product(
-        (0.0, 0.5, 1.0), (0.3, 0.4, 0.6), (0.2, 0.4, 0.6), (integrity.JUMP, tuple(jump))
+        (0.0, 0.5, 1.0), (0.3, 0.4, 0.6), (3.3, 7.7, 13.7), (integrity.JUMP, tuple(jump))
     ):
         tried = more, temper, recovers, odds
         _use(found, *tried)
@@ -300,7 +304,7 @@ def fit(rows: list[Row]) -> None:
         best = min(best, (cost, *tried))
     _use(found, *best[1:])
     print("WEIGHTS", np.round(integrity.WEIGHTS, 3).tolist(), "JUMP", np.round(integrity.JUMP, 2))
-    print("TEMPER, RECOVERS", best[2:4])
+    print("TEMPER, RECOVERS", best[2:4], f"RETURNS {integrity.RETURNS:.2f}")
 
 
 def _use(

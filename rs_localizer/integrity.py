@@ -34,13 +34,16 @@ NAMES = "apart", "spread", "count", "innovation"
 """Names of the numbers of a frame."""
 # The regression: the constant, then the weights of NAMES; an innovation counts as a jump only.
 WEIGHTS = np.array([0.863, 0.344, -1.623, -0.226, 0.0])
-# Weight of a frame's log odds beside those of earlier frames; probabilities per frame that a right
-# track goes wrong and that a wrong one recovers; probabilities that a first pose is wrong in either
-# way.
-TEMPER, GOES_WRONG, RECOVERS, FIRST = 0.4, 0.001, 0.6, (0.015, 0.005)
-# Probability per frame that a track is right again after a jump, unseen: it came back in small
-# steps. Without it, one false alarm would last until the track ends.
-RETURNS = 0.001
+# Weight of a frame's log odds beside those of earlier ones, if it comes as those of the fit do (s):
+# frames that are closer err together.
+TEMPER, PERIOD = 0.4, 1.0 / 15.0
+# Rates per second at which a right track goes wrong and a wrong one recovers; probabilities that a
+# first pose is wrong in either way.
+GOES_WRONG, RECOVERS, FIRST = 0.015, 13.7, (0.015, 0.005)
+# Rate per second at which a track is right again after a jump, unseen, as wrong tracks of the fit
+# are: 1.2 where a part of the map is wrong, 0 where all of it is. A camera that was carried is
+# doubted for 0.9 s.
+RETURNS = 0.3
 # Log odds that an innovation is a jump to a wrong or a right pose (constant and factor), and the
 # highest probability that a jump may give.
 JUMP, MOST_JUMP = (-15.57, 5.34), 0.65
@@ -194,24 +197,34 @@ class Integrity:
             ]
         )
 
-    def add(self, numbers: Array) -> float:
-        """Return the probability that the pose is wrong, after a frame with these numbers (4,)."""
+    def add(self, numbers: Array, seconds: float) -> float:
+        """Return the probability that the pose is wrong, after a frame with these numbers (4,).
+
+        Args:
+            numbers: of the frame.
+            seconds: since the last frame with a pose.
+        """
         said = min(max(float(WEIGHTS[0] + WEIGHTS[1:] @ numbers), -_MOST_ODDS), _MOST_ODDS)
+        weight = TEMPER
         if not self._is_first:
-            self._chances = _transitions(float(numbers[INNOVATION])) @ self._chances
+            self._chances = _transitions(float(numbers[INNOVATION]), seconds) @ self._chances
+            weight = min(TEMPER * seconds / PERIOD, 1.0)
         self._is_first = False
-        self._chances *= [1.0, math.exp(TEMPER * said), 1.0]
+        self._chances *= [1.0, math.exp(weight * said), 1.0]
         self._chances /= self._chances.sum()
         return float(1.0 - self._chances[0])
 
 
-def _transitions(innovation: float) -> Array:
+def _transitions(innovation: float, seconds: float) -> Array:
     """Return the probabilities (3,3) of the next state (rows) for each last state (columns)."""
     odds = JUMP[0] + JUMP[1] * innovation
     jump = min(1.0 / (1.0 + math.exp(-odds)), MOST_JUMP)
-    stays, goes = 1.0 - GOES_WRONG, GOES_WRONG
+    both = GOES_WRONG + RECOVERS
+    mixed = -math.expm1(-both * seconds) / both
+    goes, recovers = GOES_WRONG * mixed, RECOVERS * mixed
+    stays, lasts = 1.0 - goes, (1.0 - goes) * (1.0 - jump) * math.exp(-RETURNS * seconds)
     return np.array([
-        [stays * (1.0 - jump), RECOVERS, stays * jump + RETURNS],
-        [goes, 1.0 - RECOVERS, goes],
-        [stays * jump, 0.0, stays * (1.0 - jump) - RETURNS],
+        [stays * (1.0 - jump), recovers, stays - lasts],
+        [goes, 1.0 - recovers, goes],
+        [stays * jump, 0.0, lasts],
     ])  # fmt: skip

@@ -640,7 +640,7 @@ class Tracker:
             return result
         seconds = 0.0 if self._track is None else 1e-9 * (time_ns - self._track.time_ns)
         numbers = self._integrity.numbers(result, points, prior, seconds)
-        return replace(result, integrity=self._integrity.add(numbers))
+        return replace(result, integrity=self._integrity.add(numbers, seconds))
 
     def _prior(
         self, time_ns: int, rotation: RotationPrior | None, span: float | None,

@@ -34,7 +34,8 @@ def estimate(kept: Any, tracked: bool = True) -> Estimate:
 def run(frames: int, kept: Any, prior: Prior | None = None) -> list[float]:
     judge, doubts = Integrity(Acceleration()), []
     for i in range(frames):
-        doubts.append(judge.add(judge.numbers(estimate(kept(), i > 0), POINTS, prior, FRAME)))
+        numbers = judge.numbers(estimate(kept(), i > 0), POINTS, prior, FRAME)
+        doubts.append(judge.add(numbers, FRAME))
     return doubts
 
 
@@ -59,13 +60,13 @@ def test_chance_outliers_are_no_doubt_and_a_part_that_fits_alone_is():
 def test_doubt_falls_again():
     judge = Integrity(Acceleration())
     doubts = [
-        judge.add(judge.numbers(estimate(kept), POINTS, None, FRAME))
+        judge.add(judge.numbers(estimate(kept), POINTS, None, FRAME), FRAME)
         for kept in (*(near() for _ in range(10)), *(anywhere() for _ in range(15)))
     ]
     assert doubts[9] > 0.2
     assert doubts[-1] < 0.05
     judge.reset()
-    assert judge.add(judge.numbers(estimate(anywhere()), POINTS, None, FRAME)) < 0.1
+    assert judge.add(judge.numbers(estimate(anywhere()), POINTS, None, FRAME), FRAME) < 0.1
 
 
 def jumping(unseen: float) -> list[float]:
@@ -77,7 +78,7 @@ def jumping(unseen: float) -> list[float]:
         motion = Motion(np.eye(3), aside, np.zeros(3), np.zeros(3))
         prior = Prior(motion=motion, covariance=1e-4 * np.eye(12))
         seen = estimate(anywhere(), i > 0), POINTS, prior, unseen if jumps else FRAME
-        doubts.append(judge.add(judge.numbers(*seen)))
+        doubts.append(judge.add(judge.numbers(*seen), seen[-1]))
     return doubts
 
 
@@ -87,6 +88,20 @@ def test_a_pose_that_jumps_is_doubted_until_it_jumps_back():
     assert min(doubts[10:30]) > 0.5  # a map that is wrong everywhere alike shows nothing else
     assert max(doubts[31:]) < 0.5
     assert doubts[31] < doubts[29]
+
+
+@pytest.mark.parametrize("rate", [10.0, 30.0, 100.0])
+def test_a_camera_that_was_carried_is_doubted_for_a_second_at_any_rate(rate):
+    """One jump, and right images ever since; before it nothing, however often images come."""
+    judge = Integrity(Acceleration())
+    right = np.array([0.0, 0.0, 4.0, 0.0])  # nothing clusters, all of the map, sixty points
+    jump = right + np.array([0.0, 0.0, 0.0, 5.0])
+    before = [judge.add(right, 1.0 / rate) for _ in range(round(3.0 * rate))]
+    doubts = [judge.add(jump, 1.0 / rate)]
+    doubts += [judge.add(right, 1.0 / rate) for _ in range(round(3.0 * rate))]
+    assert max(before[-10:]) < 0.01
+    assert 0.6 < np.sum(np.array(doubts) > 0.5) / rate < 1.2
+    assert doubts[-1] < 0.35
 
 
 def test_a_hand_that_was_out_of_sight_has_not_jumped():

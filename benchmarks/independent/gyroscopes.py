@@ -23,6 +23,7 @@ class Imu:
     offset: float = 0.0  # s that its stamps are early: to be added to them
     scale: float = 1.0  # of the rates that it shows to the true ones
     mount: tuple[float, float, float] = (0.0, 0.0, 0.0)  # rad that it is turned on its mount
+    axes: tuple[int, int, int] = (1, 2, 3)  # of the camera, which it shows as x, y, z; or their -
     step: float = 0.0  # s by which its stamps are later after time 0
     limit: float = math.inf  # rad/s, the end of its range
 
@@ -42,6 +43,8 @@ class Imu:
         bias = self.bias * direction / np.linalg.norm(direction)
         deviation = self.noise * math.sqrt(self.rate)
         turned = self.scale * states.angular @ exponential(np.array(self.mount))
+        axes = np.array(self.axes)
+        turned = np.sign(axes) * turned[:, np.abs(axes) - 1]
         shown = turned + bias + deviation * rng.normal(size=(len(times), 3))
         shown = np.clip(shown, -self.limit, self.limit)
         stamps = times - self.offset + self.step * (times > 0.0)

@@ -46,14 +46,13 @@ from rs_localizer.estimation.linear_fit import BLOCKS, MIDDLE, TURNS
 from rs_localizer.estimation.prior import Prior, predicted, state_in
 from rs_localizer.estimation.window import MotionSample
 from rs_localizer.inertial.gravity import gravity_seen
+from rs_localizer.inertial.oddities import ComparedTurns, told_by_numbers
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.status import InertialSettings, InertialStatus
 from rs_localizer.inertial.turning import (
     BETWEEN,
     BIAS,
     DELAY,
-    MOUNT,
-    SCALE,
     WITHIN,
     GyroscopeErrors,
     Read,
@@ -77,9 +76,6 @@ _LEAST_GAIN = 0.03
 # If so many of the last frames contradict a gyroscope, that is no chance, and it has changed: what
 # it is off by is learned anew.
 _WATCHED, _CONTRADICTIONS = 12, 4
-# 99.9 % quantiles of chi-squared of 1 and 3 numbers: what is known to be off by more than the
-# settings allow is named.
-_CERTAIN = {1: 10.83, 3: 16.27}
 # A delay is hardly known whose deviation is this part of what it was at first.
 _HARDLY = 0.25
 # Row times at which a turn beside the gyroscope's is compared with none, and the 99.9 % quantile of
@@ -163,6 +159,7 @@ class GyroscopeTrack:
         self._unused: Unused | None = Unused(ImuReason.LATE)
         self._contradictions: deque[bool] = deque(maxlen=_WATCHED)
         self._age = 0  # frames since the numbers began
+        self._turns = ComparedTurns()
 
     def _begin(self) -> None:
         self.errors = GyroscopeErrors(
@@ -210,6 +207,8 @@ class GyroscopeTrack:
         if samples is None or len(samples) == 0:
             self.forget_motion()
             return None
+        if last is not None:
+            self._turns.add(samples, last)
         found = None if last is None else self.ahead(samples, middle_ns, last)
         if found is not None:
             return found
@@ -325,7 +324,7 @@ class GyroscopeTrack:
         agrees = bool(far <= 1.0)
         self._contradictions.append(not agrees)
         self._age += 1
-        often = sum(self._contradictions) >= _CONTRADICTIONS
+        often = self._contradicted()
         if not agrees:
             self.forget_motion()
             if often and self._age >= _WATCHED:
@@ -335,6 +334,11 @@ class GyroscopeTrack:
         reason = ImuReason.DISAGREES if often else ImuReason.DOUBTED
         self._unused = None if agrees and not often else Unused(reason, self._oddity())
         return self._unused is None
+
+    def _contradicted(self) -> bool:
+        """Return whether images contradict it, or have, and what it is off by is hard to learn."""
+        often = sum(self._contradictions) >= _CONTRADICTIONS
+        return often or (self._former is not None and self._turns.told() != "")
 
     def _learn(self, tied: Array, gain: Array, information: Array, pull: Array) -> None:
         mean = self.errors.mean + tied.T @ gain.T @ pull
@@ -359,19 +363,9 @@ class GyroscopeTrack:
 
     def _oddity(self) -> str:
         """Return in words what it has that the settings hardly allow for; empty: nothing."""
-        said = [words(self.errors.mean[place]) for place, words in _WORDS if self._is_odd(place)]
-        if self._former is not None:  # the delay may be another one since it is learned anew
-            off = self.errors.time_offset - self._former.time_offset
-            variance = self.errors.covariance[DELAY, DELAY] + self._former.covariance[DELAY, DELAY]
-            if off**2 > _CERTAIN[1] * variance.item():
-                said.append(f"its stamps stepped by {1e3 * abs(off):.0f} ms")
-        return " and ".join(said)
-
-    def _is_odd(self, place: slice) -> bool:
-        """Return whether numbers are certainly not zero, and more than their deviation."""
-        off, known = self.errors.mean[place], self.errors.covariance[place, place]
-        certain = off @ np.linalg.solve(known, off) > _CERTAIN[len(off)]
-        return bool(certain and np.mean(off**2) > self._before_all[place.start, place.start])
+        if self._contradicted():
+            return self._turns.told()
+        return told_by_numbers(self.errors, self._before_all.diagonal(), self._former)
 
 
 def rotation_by(found: Read, errors: GyroscopeErrors) -> RotationPrior:
@@ -380,22 +374,6 @@ def rotation_by(found: Read, errors: GyroscopeErrors) -> RotationPrior:
     known = within @ errors.covariance @ within.T + found.rest[WITHIN, WITHIN]
     covariance[np.ix_(ROTATION, ROTATION)] = known
     return RotationPrior(*found[:3], covariance, predicted=False)
-
-
-def _scale(off: Array) -> str:
-    share = float(off[np.abs(off).argmax()])
-    return f"it turns {100.0 * abs(share):.0f} % too {'fast' if share > 0.0 else 'slowly'}"
-
-
-def _mount(off: Array) -> str:
-    return f"its mount is {math.degrees(np.linalg.norm(off)):.0f} deg off"
-
-
-def _delay(off: Array) -> str:
-    return f"its stamps are {1e3 * abs(off[0]):.0f} ms {'early' if off[0] > 0.0 else 'late'}"
-
-
-_WORDS = ((SCALE, _scale), (MOUNT, _mount), (DELAY, _delay))
 
 
 def _swung(found: Estimate, rotation: RotationPrior) -> float:

@@ -256,7 +256,8 @@ class AidInput:
         oddity = "" if self._status is None else self._status.oddity
         self._odd = self._odd + 1 if oddity else 0
         if self._odd == _LONG:
-            self._notice(ImuReason.DISAGREES, f"the gyroscope is used and corrected: {oddity}")
+            use = "used and corrected" if unused is None else "not used"
+            self._notice(ImuReason.DISAGREES, f"the gyroscope is {use}: {oddity}")
         if unused is None:
             self._in_a_row.clear()
             self._reported = None

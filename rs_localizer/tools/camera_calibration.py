@@ -190,7 +190,11 @@ def calibrate(
         )
     posed = collect(camera, images, results)
     freedom = _freedom(posed.observations, intrinsics)
-    fitted = _best(camera, posed, stamps.interval, freedom)
+    fitted = _smooth(camera, posed, stamps.interval, freedom)
+    # Times of images and finer knots would follow what a stabilizer does, for minutes.
+    turned = _is_turned(fitted, stamps, images)
+    if not turned:
+        fitted = _best(camera, posed, stamps.interval, fitted, freedom)
     observations, no_mount = within(posed.observations, fitted.state.spline), ""
     if imu is not None:
         try:
@@ -202,26 +206,29 @@ def calibrate(
             no_mount = str(error)
     judged = _judged(camera, posed, observations, stamps, fitted, len(images))
     own_stamps = own_stamps or stamps.irregular
-    judged = replace(judged, no_mount=no_mount, own_stamps=own_stamps)
-    if judged.global_shutter or not abs(judged.readout_time) < stamps.interval:
-        return judged
-    direction = ScanDirection(camera.scan_direction)
-    shutter = replace(
-        judged.fit.camera,
-        readout_time=abs(judged.readout_time),
-        scan_direction=direction if judged.readout_time > 0.0 else REVERSED[direction],
-    )
-    return replace(judged, turned=is_turned(shutter, images))
+    return replace(judged, no_mount=no_mount, own_stamps=own_stamps, turned=turned)
+
+
+def _is_turned(fitted: Fit, stamps: Stamps, images: list[ImagePoints]) -> bool:
+    """Return :func:`is_turned` by the shutter that was found, if it is one."""
+    readout_time = fitted.state.readout_time
+    if not 3.0 * fitted.readout_time_deviation < abs(readout_time) < stamps.interval:
+        return False
+    direction = ScanDirection(fitted.camera.scan_direction)
+    if readout_time < 0.0:
+        direction = REVERSED[direction]
+    return is_turned(replace(fitted.camera, scan_direction=direction), images)
 
 
 def is_turned(camera: Camera, images: list[ImagePoints]) -> bool:
     """Return whether rows of images rotate otherwise than the images, as of a stabilized film."""
-    tracker, turned = Tracker(Localizer(camera)), False
+    tracker = Tracker(Localizer(camera))
     middle_ns = round(-1e9 * camera.readout_time * camera.first_row_time)
     for image in images:
         tracker.localize(image.stamp_ns + middle_ns, image.points, image.pixels)
-        turned |= tracker.shutter.rows_turn
-    return turned
+        if tracker.shutter.rows_turn:
+            return True
+    return False
 
 
 def _thinned(images: list[ImagePoints]) -> list[ImagePoints]:
@@ -249,20 +256,27 @@ def _freedom(observations: SplineKeypoints, intrinsics: bool) -> Freedom:
     )
 
 
-def _best(camera: Camera, posed: Posed, interval: float, freedom: Freedom) -> Fit:
-    """Fit the readout time, then all that is free, then the images' times and finer knots."""
+def _smooth(camera: Camera, posed: Posed, interval: float, freedom: Freedom) -> Fit:
+    """Fit the readout time, then all that is free."""
     spacing = min(LONGEST_SPACING, interval)
     spline = first_spline(posed.times, posed.rotations, posed.positions, spacing, 0.5 * interval)
     observations = within(posed.observations, spline)
     plain = fit(camera, observations, start_state(camera, observations, spline), Freedom())
-    fitted = fit(camera, observations, plain.state, _calm(plain.state, freedom), plain.deviation)
+    return fit(camera, observations, plain.state, _calm(plain.state, freedom), plain.deviation)
+
+
+def _best(camera: Camera, posed: Posed, interval: float, fitted: Fit, freedom: Freedom) -> Fit:
+    """Fit the images' times and finer knots, where they are worth it."""
+    observations = within(posed.observations, fitted.state.spline)
     with suppress(Undetermined):  # a richer model that cannot be determined is no candidate
         other = _unsteady(camera, observations, fitted, interval, freedom)
         unsteady = other.freedom.stamps > _LEAST_JITTER * interval
         if unsteady and cheaper(other, fitted, len(other.state.delays)):
             fitted = other
     with suppress(Undetermined):
-        state = replace(fitted.state, spline=refined(fitted.state.spline, 0.5 * spacing))
+        state = replace(
+            fitted.state, spline=refined(fitted.state.spline, 0.5 * min(LONGEST_SPACING, interval))
+        )
         finer = fit(camera, observations, state, fitted.freedom, fitted.deviation)
         added = 6 * (len(finer.state.spline.positions) - len(fitted.state.spline.positions))
         if cheaper(finer, fitted, added):

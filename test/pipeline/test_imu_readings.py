@@ -77,10 +77,16 @@ class Flown:
     ) -> None:  # fmt: skip
         self.flight, self.results = flight, list[Localized | Refusal]()
         self.notices: Counter[str] = Counter()
+        self.said: list[str] = []
         tree = TransformTree()
         if mounting is not False:
             tree.add(mounting or flight.mounting, static=True)
-        localizer = CameraFrames(config, lambda name, _: self.notices.update((name,)), tree)
+
+        def notice(name: str, text: str) -> None:
+            self.notices[name] += 1
+            self.said.append(text)
+
+        localizer = CameraFrames(config, notice, tree)
 
         def awaits(item: tuple[str, int, Any]) -> bool:
             frame = item[0] == "/correspondences"
@@ -172,6 +178,9 @@ def test_a_wrong_mounting_is_noticed(flight):
     flown = Flown(flight, mounting=upside_down)
     flown.assert_none_is_lost_or_wrong()
     assert flown.state.mostly.reason == ImuReason.DISAGREES
+    words = "the camera's x y z are its -x -y z"
+    assert f"the gyroscope is not used: {words}" in flown.said
+    assert flown.state.values()["IMU contradicted by the camera"] == words
 
 
 @pytest.mark.parametrize(("down", "degrees"), [((0.0, 0.0, -1.0), 0.0), ((0.0, 1.0, 0.0), 90.0)])

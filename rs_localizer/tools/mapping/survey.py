@@ -147,6 +147,9 @@ _FIRST_NOISE = 5.0, 50.0
 _LEAST_NOISE = 0.05
 # Share of the corners that fit where nothing is wrong: nearly all do.
 _LEAST_FIT = 0.8
+# Corners that are off by so many times what still fits are those of another marker: of an id that
+# is used twice, most images may fit. What a wrong shutter moves is not so far off.
+_FAR = 5.0
 # A place that is known worse than to this part of a marker's size is worth little.
 _POOR = 0.1
 MISFIT = "is their size right, and each id used once?"
@@ -259,7 +262,7 @@ def _adjusted(filmed: Filmed, markers: Sequence[Marker], chained: Chained) -> Su
     fitted, doubtful = _right_side_up(camera, seen, fitted)
     fitted = _less_noise(camera, seen, fitted)
     _check_fit(fitted)
-    fits, misfits = _fitting(seen, fitted.inliers, len(own))
+    fits, misfits = _fitting(seen, fitted, len(own))
     if misfits.any():
         return [own[k] for k in np.flatnonzero(misfits)]
     fitted = cluster_robust(_problem(camera, seen, fitted), fitted)
@@ -322,7 +325,7 @@ def _covariance(fitted: Fit, order: list[int]) -> Array:
     return covariance
 
 
-def _fitting(seen: SplineKeypoints, inliers: BoolArray, count: int) -> tuple[BoolArray, BoolArray]:
+def _fitting(seen: SplineKeypoints, fitted: Fit, count: int) -> tuple[BoolArray, BoolArray]:
     """Return masks (m,) of markers connected by fitting images, and of those that do not fit.
 
     Two walls of which each fits by itself, and no image that shows both, are not one map.
@@ -330,11 +333,15 @@ def _fitting(seen: SplineKeypoints, inliers: BoolArray, count: int) -> tuple[Boo
     images: IntArray = np.unique(seen.frames, return_inverse=True)[1]
     total = int(images.max()) + 1
     cells = total * (seen.points // 4) + images
-    corners, fit_corners = (
-        np.bincount(cells, weights, count * total).reshape(count, -1) for weights in (None, inliers)
+    far = fitted.squared_errors > (_FAR * LIMIT * fitted.deviation) ** 2
+    corners, fit_corners, far_corners = (
+        np.bincount(cells, weights, count * total).reshape(count, -1)
+        for weights in (None, fitted.inliers, far)
     )
     shown, whole = corners > 0, (corners > 0) & (fit_corners == corners)
-    most = 2 * whole.sum(axis=1) > shown.sum(axis=1)
+    counts = shown.sum(axis=1)
+    most = 2 * whole.sum(axis=1) > counts
+    most &= np.sum(far_corners > 0, axis=1) <= (1.0 - _LEAST_FIT) * counts
     whole &= most[:, None]
     together = whole.astype(float) @ whole.T
     labels = connected_components(csr_array(together), directed=False)[1]
