@@ -27,7 +27,6 @@ from rs_localizer.estimation.acceptance import (
     noise_fills,
     refusal,
     sample_estimate,
-    speeding,
     uncertain,
     unfit,
 )
@@ -448,8 +447,7 @@ class Localizer:
         if enough and posterior.determined and np.all(np.isfinite(posterior.state)):
             effect = effect_of(part)
         posterior = posterior._replace(
-            declared=math.hypot(posterior.declared, effect.residual),  # px, of map and calibration
-            speeding=speeding(observed, posterior.state),
+            declared=math.hypot(posterior.declared, effect.residual)  # px, of map and calibration
         )
         gate = self._gate(observed, posterior.state)
         failure = refusal(

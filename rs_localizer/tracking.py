@@ -34,14 +34,16 @@ from rs_localizer.core.state import (
     ANGULAR,
     LINEAR,
     PARAMETERS,
+    POSE,
     TURN,
     VELOCITIES,
+    step_between,
 )
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.estimation.known_rotation import Aid, Foretold, LastFrame
 from rs_localizer.estimation.moved_part import MovedPart, MovedParts
-from rs_localizer.estimation.prior import Prior, beside, predicted, unchecked
+from rs_localizer.estimation.prior import Prior, beside, predicted, state_in, unchecked
 from rs_localizer.estimation.window import (
     FADING,
     LENGTH,
@@ -58,7 +60,7 @@ from rs_localizer.estimation.window import (
 from rs_localizer.integrity import Integrity
 from rs_localizer.lens_watch import LensWatch
 from rs_localizer.localizer import Localizer
-from rs_localizer.repeated_images import RepeatedImages, coasting
+from rs_localizer.repeated_images import RepeatedImages, is_clear
 from rs_localizer.shutter_watch import FAR_OFF, ShutterWatch
 from rs_localizer.solvers.table import find_solver
 
@@ -542,10 +544,8 @@ class Tracker:
         """
         copies = self._images.copies(points, pixels) if self.newest_ns != time_ns else []
         self.repeats, track = bool(copies), self._track
-        if copies and track is not None:
-            prior = self._foreseen(time_ns, readings)
-            rig, last = self.localizer.rig, track.estimate
-            self._images.judge(copies, rig, last, track.time_ns, prior)
+        if copies and track is not None and self._has_left(track, time_ns, readings):
+            self._images.judge(copies, track.time_ns)
         if stale := self._images.stale(copies):
             of = f" of {', '.join(stale)}" if any(stale) else ""
             return Failure(
@@ -558,21 +558,27 @@ class Tracker:
             return None
         return replace(found, time_ns=time_ns) if self.remembers_motion else found
 
-    def _foreseen(self, time_ns: int, readings: Any) -> Prior | None:
-        """Predict the motion of a possible copy: by aid, last velocities, or others."""
-        track = self._track
+    def _has_left(self, track: _Track, time_ns: int, readings: Any) -> bool:
+        """Return whether the camera has surely moved since the last pose, by aid or velocities.
+
+        What accelerations may change is no doubt of that: a camera that rests then and now has
+        none.
+        """
+        known, pose = None, track.estimate.joint_covariance[POSE, POSE]
         if self.aid is not None and self.aid.agreed and readings:
             before = self._before(time_ns)
             known = None if before is None else self.aid.ahead(readings, time_ns, before)
-            if known is not None:
-                return known.prior
-        if track is None or track.window is None:
-            return self.prediction(time_ns)
+        if known is not None and known.prior is not None and known.prior.motion is not None:
+            there, spread = known.prior.motion, np.asarray(known.prior.covariance)[POSE, POSE]
+            step = step_between(*(state_in(each, np.zeros(3)) for each in (track.estimate, there)))
+            return is_clear(step[POSE], pose + spread)
         last = track.window.newest
         if len(track.window) == 1:  # an image shows what it shows, however fast a camera may be
             last = gaussian_of(track.estimate, track.time_ns)
         motion, covariance = last.per_readout(track.estimate.span)
-        return coasting(motion, covariance, 1e-9 * (time_ns - track.time_ns) / track.estimate.span)
+        readouts = 1e-9 * (time_ns - track.time_ns) / track.estimate.span
+        step = readouts * np.r_[motion.angular_velocity, motion.linear_velocity]
+        return is_clear(step, pose + readouts**2 * covariance[VELOCITIES, VELOCITIES])
 
     @property
     def newest(self) -> Estimate | Failure | None:

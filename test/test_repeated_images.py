@@ -5,20 +5,15 @@
 Frames are those of the independent projector, each point at the time of its own row.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from benchmarks.independent.cameras import Camera
-from rs_localizer.core.shutter import Motion
-from rs_localizer.estimation.prior import Prior
 from rs_localizer.inertial.gyro_prior import GyroscopeTrack
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.status import InertialSettings
-from rs_localizer.repeated_images import displacement
 from rs_localizer.tracking import Tracker
 
 from .moving import camera_of, inside
@@ -203,38 +198,3 @@ def test_what_is_no_image_that_came_before(held):
     assert tracker.localize(ns(5.0), points[:count], pixels[:count])
     tracker = Tracker(rsl.Localizer(CAMERA), remembers_motion=False)
     assert all(results(tracker, times[:4], [frames[0]] * 4))
-
-
-def test_displacement_is_what_samples_of_the_pose_say():
-    """Where the doubt is small: the covariance of a pixel over 4,000 poses drawn at random."""
-    rng = np.random.default_rng(3)
-    half = rng.normal(size=(6, 6)) * 1e-4 * np.array([1.0] * 3 + [5.0] * 3)
-    covariance = np.zeros((18, 18))
-    covariance[:6, :6] = half.T @ half
-    covariance[range(6, 18), range(6, 18)] = 1e-6
-    points = MAP[:5]
-
-    def seen(turn, place):
-        local = Rotation.from_rotvec(turn).inv().apply(points - place)
-        return TRUE.project(local)
-
-    turn, place = np.array([0.01, -0.02, 0.005]), np.array([0.02, 0.01, 0.0])
-    rotation = Rotation.from_rotvec(turn)
-    drawn = rng.multivariate_normal(np.zeros(6), covariance[:6, :6], 4000)
-    pixels = np.array([
-        seen((rotation * Rotation.from_rotvec(r)).as_rotvec(), place + rotation.apply(s))
-        for r, s in drawn.reshape(-1, 2, 3)
-    ])  # fmt: skip
-    noise, moved = 0.2, seen(turn, place) - seen(np.zeros(3), np.zeros(3))
-    expected = max(
-        move @ np.linalg.solve(np.cov(own.T) + noise**2 * np.eye(2), move)
-        for move, own in zip(moved, np.swapaxes(pixels, 0, 1), strict=True)
-    )
-    last = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    there = replace(
-        last, rotation=rotation.inv().as_matrix(), translation=-rotation.inv().apply(place)
-    )
-    prior = Prior(motion=there, covariance=covariance)
-    found = displacement(CAMERA.project, points, last, prior, noise)
-    assert found == pytest.approx(np.sqrt(expected), rel=0.05)
-    assert displacement(CAMERA.project, points, last, Prior(), noise) == 0.0
