@@ -50,8 +50,7 @@ from rs_localizer.native import entry
 
 # If the readout time is off by more than this share, single frames are better than tracked ones.
 # The errors of a hand's angular velocity, tracked over single, are 0.95, 1.3 and 1.5 if it is off
-# by a factor of 1.3, 1.5 and 1.7 (150 points, 0.3 px). A time known to a half is off by a third in
-# the median.
+# by a factor of 1.3, 1.5 and 1.7 (150 points, 0.3 px).
 FAR_OFF = 0.5
 _MOST_POINTS = 200  # of a frame: more points take longer than they are worth
 # Points count within this many inlier thresholds, because the axis may be the wrong one.

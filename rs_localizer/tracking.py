@@ -220,10 +220,10 @@ class Tracker:
         """Set new mounts of the same cameras; the rig's axes stay the same."""
         self.localizer = self._allowing = Localizer(rig, self.localizer.config)
 
-    def _trusts_motion(self, context: FrameContext) -> bool:
+    def _trusts_motion(self) -> bool:
         """Return whether motion between frames predicts the motion within one."""
         least = min(camera.readout_time for camera in self.localizer.rig.cameras.values())
-        known = self._readout_time_deviation(context) < FAR_OFF * least
+        known = self.shutter.error < FAR_OFF * least
         return self.remembers_motion and self.shutter.trusted and known
 
     def _readout_time_deviation(self, context: FrameContext) -> float:
@@ -467,7 +467,7 @@ class Tracker:
                 result = self.lens.widened(result, *seen)
             result = self.shutter.widened(result)
             if self.remembers_motion:
-                result = self._covering(replace(result, time_ns=time_ns), context)
+                result = self._covering(replace(result, time_ns=time_ns))
                 self._remember(time_ns, told, result, context)
         self._keep(_Seen(time_ns, result, points, pixels, stamps))
         self._images.add(time_ns, points, pixels)
@@ -610,14 +610,14 @@ class Tracker:
             if own and seen.time_ns in known:
                 seen.found = self._published(seen, window.before(known[seen.time_ns]))
 
-    def _covering(self, result: Estimate, context: FrameContext) -> Estimate:
+    def _covering(self, result: Estimate) -> Estimate:
         """Return the estimate with velocities as uncertain as frames show them, if rows may not.
 
         Rows of a readout time that nobody knows may all have been exposed at once: then they show
         no motion, however fast the camera is.
         """
         track, config = self._track, self.localizer.config
-        if track is None or self._trusts_motion(context):
+        if track is None or self._trusts_motion():
             return result
         seconds = 1e-9 * (result.time_ns - track.time_ns)
         if not seconds > 0.0:
@@ -656,7 +656,7 @@ class Tracker:
         if not self.remembers_motion:
             return Prior(of_rest=self.shutter.of_rest) if rotation is None else None
         prior = self.prediction(time_ns, span, context)
-        if prior is not None and not self._trusts_motion(context):
+        if prior is not None and not self._trusts_motion():
             rest = self.shutter.of_rest if rotation is None else 0.0
             prior = replace(prior, covariance=_UNKNOWN, of_rest=rest)
         if rotation is None:
@@ -695,7 +695,7 @@ class Tracker:
     ) -> MotionWindow:
         """Return a window of the last frames and this one; if it denies them, of this one alone."""
         track, share = self._track, self._readout_time_deviation(context) / result.span
-        if track is not None and told is not None and self._trusts_motion(context):
+        if track is not None and told is not None and self._trusts_motion():
             window = replace(track.window, readout_share=share).joined(told)
             if window.surprise < _MOST_INNOVATION:  # NaN, of rounding errors, is not
                 return window
