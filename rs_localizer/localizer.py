@@ -27,6 +27,7 @@ from rs_localizer.estimation.acceptance import (
     noise_fills,
     refusal,
     sample_estimate,
+    speeding,
     uncertain,
     unfit,
 )
@@ -447,7 +448,8 @@ class Localizer:
         if enough and posterior.determined and np.all(np.isfinite(posterior.state)):
             effect = effect_of(part)
         posterior = posterior._replace(
-            declared=math.hypot(posterior.declared, effect.residual)  # px, of map and calibration
+            declared=math.hypot(posterior.declared, effect.residual),  # px, of map and calibration
+            speeding=speeding(observed, posterior.state),
         )
         gate = self._gate(observed, posterior.state)
         failure = refusal(

@@ -24,6 +24,7 @@ from rs_localizer.core.state import (
     STATE_LINEAR_ACCELERATION,
     STATE_TRANSLATION,
     TURN,
+    VELOCITIES,
     rotation_of,
 )
 from rs_localizer.core.types import Estimate, Failure
@@ -122,6 +123,14 @@ def noise_fills(posterior: Posterior, rolling: bool) -> bool:
     """Return whether errors are as large as the gate allows, so that the noise is unknown."""
     most = _MOST_NOISE if rolling else _MOST_NOISE_GLOBAL_SHUTTER
     return posterior.noise > most * posterior.gate
+
+
+def speeding(observed: Observed, state: Array) -> float:
+    """Return the squared velocities, in standard deviations that the configuration expects."""
+    # Of the others a rotation prior knows.
+    part = VELOCITIES if observed.rotation is None else LINEAR
+    velocities = state[POSE_SIZE - POSE.stop :][part]
+    return float(velocities @ observed.terms.informations[0][part, part] @ velocities)
 
 
 def uncertain(estimate: Estimate) -> Failure | None:

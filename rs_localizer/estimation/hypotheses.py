@@ -116,6 +116,7 @@ class Posterior(NamedTuple):
     model_error: float = 0.0  # px, root mean square of what the motion leaves beside the noise
     shared: float = 0.0  # px, likewise, of all modes together
     declared: float = 0.0  # px, the part of it that the map is known to be off
+    speeding: float = 0.0  # squared velocities, in deviations of what the configuration expects
     # Probabilities of the typical speeds; empty: the configured one
     speeds: Array = np.zeros(0)
     # (18,18) with the second order of arcs, of a mixture; None: of the covariance as a Gaussian's

@@ -21,6 +21,7 @@ from rs_localizer.core.lens import centre_of, off_centre
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, TURN, step_between
 from rs_localizer.core.types import Failure
+from rs_localizer.estimation.acceptance import speeding
 from rs_localizer.estimation.calibration import promised
 from rs_localizer.estimation.hypotheses import Posterior
 from rs_localizer.estimation.linear_fit import known_at
@@ -137,7 +138,8 @@ def left_out(
         f"{found} points fit one motion, and {size} of the {left} left out have a pose of "
         f"their own, {math.degrees(turn):.1f} deg and {move:.2g} m away"
     )
-    if _odds(found, size) > (1.0 if known else _LEAST_ODDS):
+    faster = max(posterior.speeding - speeding(observed, second.state), 0.0)
+    if _odds(found, size, faster) > (1.0 if known else _LEAST_ODDS):
         # A part is one thing, however many of its landmarks a frame shows: either may have moved.
         moment = np.outer(step, step) + second.covariance
         other = size / (found + size) * moment[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
@@ -182,14 +184,15 @@ def _rough(observed: Observed, posterior: Posterior) -> str:
     )
 
 
-def _odds(size: int, other: int) -> float:
+def _odds(size: int, other: int, faster: float) -> float:
     """Return the odds that a group of points is the world's and the other one a body's.
 
-    Of a body points are with an unknown chance below one half.
+    Of a body points are with an unknown chance below one half; the world has the motion that is
+    expected of the camera, by squared velocities that differ by ``faster``.
     """
     # Of the chance's posterior, a beta distribution, near a normal one from some ten points on.
     below = 0.5 * math.erfc((other - size) / math.sqrt(2.0 * (size + other + 1.0)))
-    return below / max(1.0 - below, 1e-300)
+    return below / max(1.0 - below, 1e-300) * math.exp(-0.5 * faster)
 
 
 def _own_motion(

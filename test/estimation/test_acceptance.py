@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is refused, reason by reason: posteriors that are right but for one thing."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from rs_localizer.core.reasons import Reason
-from rs_localizer.estimation.acceptance import refusal
+from rs_localizer.estimation.acceptance import refusal, speeding
 from rs_localizer.estimation.prior import motion_terms
 
 from .frames import fitted, frame
@@ -51,3 +53,14 @@ def test_what_cannot_be_computed_is_no_motion(good, part):
     lost = getattr(good, part).copy()
     lost.flat[-1] = np.nan
     assert reason(good._replace(**{part: lost})) is Reason.DEGENERATE
+
+
+def test_speeding_counts_what_the_configuration_expects():
+    state, information = np.zeros(24), np.zeros((18, 18))
+    state[12:15], state[15:18] = (0.2, 0.0, -0.1), (0.0, 0.03, 0.0)
+    np.fill_diagonal(information[6:9, 6:9], 0.1**-2)
+    np.fill_diagonal(information[9:12, 9:12], 0.01**-2)
+    observed = SimpleNamespace(rotation=None, terms=SimpleNamespace(informations=[information]))
+    assert speeding(observed, state) == pytest.approx(5.0 + 9.0)
+    observed.rotation = "of a gyroscope"
+    assert speeding(observed, state) == pytest.approx(9.0)
