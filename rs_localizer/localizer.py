@@ -378,9 +378,8 @@ class Localizer:
         gate, in_frame = self._gate(observed, best.state), None
         if observed.rotation is not None:
             in_frame = coupled_turn(observed.rotation, terms is not observed.terms)
-        one_lens = observed.exposure.alone
         assumed = replace(
-            observed.assumed, may_rest=may_rest, one_lens=one_lens, in_frame=in_frame,
+            observed.assumed, may_rest=may_rest, lenses=observed.exposure.lenses, in_frame=in_frame,
             noise=_NOISE * gate,
         )  # fmt: skip
         observations = observed.observations
