@@ -20,7 +20,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Rig, RigEstimate
 from rs_localizer.core.rotation_prior import RotationPrior
-from rs_localizer.core.state import POSE
+from rs_localizer.core.state import POSE, rotation_of
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.acceptance import (
     estimate_of,
@@ -379,9 +379,8 @@ class Localizer:
         gate, in_frame = self._gate(observed, best.state), None
         if observed.rotation is not None:
             in_frame = coupled_turn(observed.rotation, terms is not observed.terms)
-        one_lens = observed.exposure.alone
         assumed = replace(
-            observed.assumed, may_rest=may_rest, one_lens=one_lens, in_frame=in_frame,
+            observed.assumed, may_rest=may_rest, lenses=observed.exposure.lenses, in_frame=in_frame,
             noise=_NOISE * gate,
         )  # fmt: skip
         observations = observed.observations
@@ -464,10 +463,14 @@ class Localizer:
         if odd.failure is not None:
             return odd.failure
         if parts is not None:
+            seen = observed.points[observed.usable.indices], posterior.inliers
+            axes = np.kron(np.eye(4), rotation_of(posterior.state))  # camera_from_map
+            other = parts.beside(odd.group, axes.T @ odd.other @ axes, *seen)
+            odd = odd._replace(other=axes @ other @ axes.T)
             parts.add(
                 partial(look_at, observed, posterior, terms),
-                partial(neighbours_alike, observed, posterior),
-            )
+                partial(neighbours_alike, observed, posterior), *seen,
+            )  # fmt: skip
             if parts.part is not part:
                 effect = effect_of(parts.part)
         effect = widened(effect, posterior)

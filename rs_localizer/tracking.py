@@ -41,6 +41,7 @@ from rs_localizer.core.state import (
 )
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import ErrorModes
+from rs_localizer.estimation.frames_together import CamerasTogether
 from rs_localizer.estimation.known_rotation import Aid, Foretold, LastFrame
 from rs_localizer.estimation.moved_part import MovedPart, MovedParts
 from rs_localizer.estimation.prior import Prior, beside, predicted, state_in, unchecked
@@ -172,6 +173,7 @@ class Tracker:
         rig = localizer.rig
         alone = rig.exposure().ahead() if len(rig.cameras) == 1 else None
         self.lens = LensWatch(alone if self.shutter.watches else None, localizer.config)
+        self.cameras = CamerasTogether(rig, localizer.config)
         self._integrity = Integrity(localizer.config.acceleration)
         self._parts = MovedParts(localizer.config.map_deviation)
         self._last_ns: int | None = None
@@ -189,6 +191,7 @@ class Tracker:
         self._images, self.repeats = RepeatedImages(), False
         self.shutter.reset()
         self.lens.reset()
+        self.cameras = CamerasTogether(self.localizer.rig, self.localizer.config)
         self._allowing = self.localizer
         if self.aid is not None:
             self.aid.reset()
@@ -219,6 +222,7 @@ class Tracker:
     def mount(self, rig: Rig) -> None:
         """Set new mounts of the same cameras; the rig's axes stay the same."""
         self.localizer = self._allowing = Localizer(rig, self.localizer.config)
+        self.cameras = CamerasTogether(rig, self.localizer.config)
 
     def _trusts_motion(self) -> bool:
         """Return whether motion between frames predicts the motion within one."""
@@ -461,6 +465,10 @@ class Tracker:
             doubtful = self.shutter.error or not self.shutter.trusted
             if doubtful and self.remembers_motion:  # alone, frames may have any velocities
                 self._parts.discard()
+        elif result and self.remembers_motion and isinstance(points, Mapping):
+            terms = self.localizer.known_of(None, result.span)
+            self.cameras.add(result, terms, points, stamps)
+            result = self.cameras.widened(result)
         if result:
             result = self._judged(time_ns, result, points, prior)
             if pixels is not None:

@@ -90,11 +90,12 @@ def middle_of(rig: Mapping[str, Mounted]) -> float:
 
 def views(
     rig: Mapping[str, Mounted], motions: Moving, begin: Array, count: int, scene: Scene,
-    rng: np.random.Generator,
+    rng: np.random.Generator, wider: float = 0.0,
 ) -> dict[str, Views]:  # fmt: skip
     """So many points before each camera, other ones for each.
 
     Args:
+        wider: parts of the image by which they lie outside it, too.
         begin: (f,) time of each motion at which its frame begins.
     """
     which = np.arange(len(begin))
@@ -105,7 +106,8 @@ def views(
     result = {}
     for name, mounted in rig.items():
         size = np.array([mounted.camera.width, mounted.camera.height]) - 1.0
-        pixels = rng.uniform(_MARGIN, size - _MARGIN, (len(begin), count, 2))
+        beside = _MARGIN - wider * size
+        pixels = rng.uniform(beside, size - beside, (len(begin), count, 2))
         ones = np.ones((*pixels.shape[:2], 1))
         rays = np.concatenate([mounted.camera.bearings(pixels), ones], axis=-1) @ mounted.rotation
         centre = -mounted.rotation.T @ mounted.translation

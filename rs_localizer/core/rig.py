@@ -280,6 +280,11 @@ class Exposure:
         """True if one camera sees the frame."""
         return len(self.cameras) == 1
 
+    @property
+    def lenses(self) -> IntArray | None:
+        """Which of several cameras each side (k,) is of; None: there is one."""
+        return None if self.alone else np.array([side.place for side in self.sides])
+
     def ahead(self, pixels: Array | None = None) -> Exposure:
         """Return the exposure of a single camera that sees only what lies before its image plane.
 

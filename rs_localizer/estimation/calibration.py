@@ -28,7 +28,7 @@ from rs_localizer.core.lens import by_lens, coefficients_of, corner_of
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE, TURN, rotation_of
 from rs_localizer.estimation.hypotheses import Posterior
-from rs_localizer.estimation.linear_fit import ORDINARY, known_at, smooth_columns
+from rs_localizer.estimation.linear_fit import ORDINARY, known_at, smooth_columns_of
 from rs_localizer.estimation.moved_part import MovedPart
 from rs_localizer.estimation.points import Observed, rays_of_lens
 from rs_localizer.estimation.prior import SPEEDS, PriorTerms, terms_at
@@ -147,7 +147,8 @@ def calibration_effect(
         columns = np.concatenate([columns, by_point @ np.concatenate(modes, axis=2)], axis=2)
     bend = posterior.bend[chosen] if posterior.bend.shape[1] else np.zeros((len(rays), 0))
     of_speeds = posterior.speeds if len(posterior.speeds) else _CONFIGURED
-    smooth = posterior.shared * smooth_columns(by_motion, image, bend)
+    lens = some.lens_of(exposure.lenses)
+    smooth = posterior.shared * smooth_columns_of(by_motion, image, bend, lens)
     rows = np.concatenate([smooth, by_motion, columns], axis=2).reshape(2 * len(rays), -1)
     every = found / len(rays) * (rows.T @ rows)
     variance, first = posterior.noise**2, smooth.shape[2]

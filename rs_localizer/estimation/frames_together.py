@@ -17,24 +17,37 @@ the angle: what one three hardly tells, some from different angles do.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, Array1, Array2, Array3, IntArray1
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import centre_of
-from rs_localizer.core.rig import Exposure, Mounts
-from rs_localizer.core.state import MOVE, PARAMETERS, STATE_ANGULAR, STATE_LINEAR, VELOCITIES
+from rs_localizer.core.rig import Exposure, Mounts, Rig
+from rs_localizer.core.shake import shake_at
+from rs_localizer.core.state import (
+    MOVE,
+    PARAMETERS,
+    POSE,
+    POSE_SIZE,
+    STATE_ANGULAR,
+    STATE_LINEAR,
+    VELOCITIES,
+)
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.calibration import LandmarkErrors
-from rs_localizer.estimation.points import find_usable, pack, packed
+from rs_localizer.estimation.linear_fit import known_at
+from rs_localizer.estimation.points import checked_of_rig, find_usable, pack, packed
+from rs_localizer.estimation.prior import PriorTerms, state_in
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.native import entry
 
@@ -93,6 +106,16 @@ _ALIKE = 1.6
 _STRETCHED_SURELY = 6.0
 # Frames together may leave so many times the variance (px^2) that each leaves alone.
 _AS_GOOD = math.e
+# Numbers of a camera of a rig: rotation (rad) and move (m) of its mount, in the rig's axes; focal
+# length (logarithm); how much later (s) it is exposed. They may be as large as the first. Who has
+# calibrated is off by the second: 0.06 deg, 2 mm, 0.3 ms.
+_OF_CAMERA, _LATE = 8, 7
+_ANY_CAMERA = np.array([*np.full(3, 0.1), *np.full(3, 0.1), 0.1, 0.03])
+_OF_MOUNT, _OF_CLOCK = (*np.full(3, 0.001), *np.full(3, 0.002)), 0.0003
+_BEYOND_USUAL = 5.0
+_REMEDY = "are mounts, stamps and K those of these cameras (rs_localizer calibrate --rig)?"
+# Of what frames tell, the part that the next one knows: mounts are bumped.
+_KEPT_OF_CAMERAS = 0.97
 # fy over fx changes as each changes by a half, the other way.
 _ASPECT = np.array([-0.5, 0.5])
 
@@ -602,6 +625,109 @@ class FramesTogether:
         total = np.diag(self._known) + sum(every)
         without = [np.linalg.inv(total - one)[_LENGTH, _LENGTH] for one in every]
         return int(np.argmin(without))
+
+
+class CamerasTogether:
+    """Compares the cameras of a rig with each other, by the last frames together.
+
+    The motion of one frame takes up a part of what one of its cameras has wrong. Mounts, focal
+    lengths and clocks stay as they are while the motion changes: each frame has its motion for
+    itself, and shares these numbers with all others.
+
+    Args:
+        rig: as it is said to be.
+        config: with the deviations of the calibrations.
+    """
+
+    def __init__(self, rig: Rig, config: LocalizerConfig) -> None:
+        self.rig, count = rig, _OF_CAMERA * len(rig.cameras)
+        self._usual = np.array([*_OF_MOUNT, math.hypot(_USUAL, config.calibration.focal_length),
+                                _OF_CLOCK])  # fmt: skip
+        self._equations, self._count = np.zeros((count + 1, count + 1)), 0
+        self._off: list[tuple[str, Array]] = []
+        self.fault = ""
+        """The camera that frames show to be wrong, and what it has, in one sentence."""
+
+    def add(
+        self, found: Estimate, terms: PriorTerms, parts: Mapping[str, Sequence[ArrayLike]],
+        stamps: Mapping[str, float] | None,
+    ) -> None:  # fmt: skip
+        """Take a frame of a rig with a pose, and what is known of its motion beside it."""
+        exposure, counts, points, pixels, _ = checked_of_rig(self.rig, parts, stamps)
+        if exposure.lenses is None:
+            return
+        usable = find_usable(exposure, points, pixels, counts, None)
+        some = usable.indices[np.asarray(found.inliers)[usable.indices]]
+        seen = packed(exposure, points, usable._replace(indices=some))
+        state = state_in(found, usable.centre)
+        lines = linearized(seen.packed, len(seen), state, shake_at(seen.tau, found.shake))
+        tau, by_pose = seen.tau[:, None], lines.by_motion[:, :, POSE]
+        way = state[POSE_SIZE:].reshape(2, 6)
+        own = np.concatenate([
+            by_pose, (seen.by_ray @ lines.image[:, :, None]),
+            by_pose @ (way[0] + tau * way[1])[:, :, None] / exposure.span,
+        ], axis=2)  # fmt: skip
+        places = np.array([list(self.rig.cameras).index(name) for name in exposure.names])
+        columns = np.zeros((len(seen), 2, len(self.rig.cameras), _OF_CAMERA))
+        columns[np.arange(len(seen)), :, places[exposure.lenses[seen.camera]]] = own
+        rows = np.concatenate(
+            [lines.by_motion, columns.reshape(len(seen), 2, -1), lines.errors[:, :, None]], axis=2
+        ).reshape(2 * len(seen), -1)
+        if not np.isfinite(rows).all():  # of an absurd motion
+            return
+        best, _, rank, _ = np.linalg.lstsq(rows[:, :-1], rows[:, -1])
+        left = float(np.square(rows[:, -1] - rows[:, :-1] @ best).sum())
+        variance = max(left / max(len(rows) - rank, 1), _LEAST_NOISE**2)
+        every, of_motion = rows.T @ rows / variance, np.r_[:PARAMETERS, rows.shape[1] - 1]
+        every[np.ix_(of_motion, of_motion)] += known_at(terms, state).form
+        motion, rest = slice(PARAMETERS), slice(PARAMETERS, None)
+        gain = np.linalg.solve(every[motion, motion], every[motion, rest])
+        self._equations = _KEPT_OF_CAMERAS * self._equations + every[rest, rest]
+        self._equations -= every[rest, motion] @ gain
+        self._count += 1
+        if self._count >= FRAMES:
+            said = [self._against(reference) for reference in range(len(self.rig.cameras))]
+            self._off = min(said, key=len)
+            of = f", seen from {list(self.rig.cameras)[said.index(self._off)]}: {_REMEDY}"
+            has = ", ".join(text for text, _ in self._off)
+            self.fault = f"successive frames fit if {has}{of}" if has else ""
+
+    def widened(self, found: Estimate) -> Estimate:
+        """Return a frame whose pose may be that of any camera, if one contradicts the others."""
+        speeds = np.concatenate([found.angular_velocity, found.linear_velocity]) / found.span
+        covariance = found.calibration_covariance.copy()
+        for _, numbers in self._off:
+            step = numbers[POSE] + numbers[_LATE] * speeds
+            covariance[POSE, POSE] += np.outer(step, step)
+        return replace(found, calibration_covariance=covariance) if self._off else found
+
+    def _against(self, reference: int) -> list[tuple[str, Array]]:
+        """Name what cameras have wrong, with their numbers, if mount and clock of one are right."""
+        known = np.tile(_ANY_CAMERA**-2.0, (len(self.rig.cameras), 1))
+        known[reference, [*range(6), _LATE]] = _EXACT**-2
+        information = self._equations[:-1, :-1] + np.diag(known.ravel())
+        covariance = np.linalg.inv(information)
+        numbers, texts = -covariance @ self._equations[:-1, -1], []
+        for k, (name, (axes, moved)) in enumerate(self.rig.camera_from_rig.items()):
+            own = slice(_OF_CAMERA * k, _OF_CAMERA * (k + 1))
+            by = np.eye(_OF_CAMERA)
+            by[3:6, :3] = so3.hat(axes.T @ moved)  # of the camera's centre, where the rig turns
+            off, spread = by @ numbers[own], by @ covariance[own, own] @ by.T
+            spread = _ALIKE**2 * spread + np.diag(self._usual**2)
+            beyond = [
+                off[part] @ np.linalg.solve(spread[part, part], off[part]) > _BEYOND_USUAL**2
+                for part in (slice(3), slice(3, 6), slice(6, 7), slice(7, 8))
+            ]
+            late = "later" if off[_LATE] > 0.0 else "earlier"
+            said = (
+                f"rotated by {math.degrees(np.linalg.norm(off[:3])):.2g} deg",
+                f"{np.linalg.norm(off[3:6]):.2g} m from its mount",
+                f"of a focal length {math.exp(off[6]):.3g} times K's",
+                f"exposed {abs(1e3 * off[_LATE]):.2g} ms {late} than its stamps say",
+            )
+            if has := " and ".join(compress(said, beyond)):
+                texts.append((f"{name} is {has}", numbers[own]))
+        return texts
 
 
 def _disagreement(threes: Sequence[_Equations], numbers: Array) -> float:

@@ -52,7 +52,7 @@ from rs_localizer.estimation.linear_fit import (
     moved,
     nothing_shared,
     of_changed,
-    smooth_error,
+    smooth_errors,
     under,
 )
 from rs_localizer.estimation.points import MOST_POINTS, NEAREST, Observations, plane_of
@@ -242,8 +242,8 @@ def _given(
     if assumed.rolling:
         if declared:
             bend = bend_of(points, best.inliers, depth / assumed.focal_length)
-        if assumed.one_lens:
-            shared = smooth_error(lines, best.inliers, bend, size)
+        lens = observations.lens_of(assumed.lenses)
+        shared = smooth_errors(lines, best.inliers, bend, size, lens)
     left = float(best.squared_errors[best.inliers].sum()) / max(best.freedom, 1.0)
     noise = Noise(
         best.noise, max(best.noise**2 / max(left, LEAST_NOISE**2), 1.0),
@@ -378,6 +378,7 @@ def _vibrating(
 ) -> _Camera | None:
     """Return hypotheses with in-frame rotation, if such a fit converges to as many points."""
     best, threshold, in_frame = given.best, given.threshold, given.assumed.in_frame
+    lens = given.observations.lens_of(given.assumed.lenses)
     noise, fewest = best.noise, max(_KEPT * np.count_nonzero(best.inliers), _FEWEST_TURNING)
     # Near a rotation that is known the frame is more linear.
     short = _SHORT if in_frame is None else 1.0
@@ -387,7 +388,7 @@ def _vibrating(
         now = _at(given, state, turn, gate)
         if np.count_nonzero(now.inliers) < _FEWEST_TURNING:
             return None
-        shared = smooth_error(now.lines, now.inliers, given.bend, given.size).at(given.size)
+        shared = smooth_errors(now.lines, now.inliers, given.bend, given.size, lens).at(given.size)
         if not len(shared.squares):  # columns of an absurd motion are no numbers
             return None
         still = apply_step(now.state, -MIDDLE @ now.turn)

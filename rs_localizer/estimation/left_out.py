@@ -75,6 +75,17 @@ _BENT, _BENT_OFF_CENTRE = 10.0, 1.0
 # probable where K is off by 0.048: the principal point of a phone is by 0.012, and of a lens of
 # which a third is missing by 0.03 (paired set).
 _USUAL = 0.01
+ORDERS = [
+    tuple((first + step * k) % 4 for k in range(4))
+    for step in (1, -1)
+    for first in range(4)
+    if (first, step) != (0, 1)
+]
+"""The other orders in which the four corners of a marker may be given."""
+_CORNERS = ("upper left", "upper right", "lower right", "lower left")
+# Four points in a row are a marker's corners if they are out of a parallelogram by less than this
+# share of a side; of them another order explains so many, where ours does less than a half.
+_ROUND, _FLAT, _FIT = np.array([1.0, -1.0, 1.0, -1.0]), 0.01, 0.7
 # Gates fall by this part from step to step, to the last one, with its steps. With 0.7 two of 72
 # wrong matrices were lost on the way.
 _NARROWER, _LAST_STEPS = 0.8, 6
@@ -87,6 +98,8 @@ class LeftOut(NamedTuple):
     notice: str = ""
     other: Array = np.zeros((MOTION_PARAMETERS,) * 2)
     """Second moment of the motion of points that are left out, about the frame's."""
+    group: BoolArray = np.zeros(0, np.bool_)
+    """(n,) these points; empty: none."""
 
 
 class _Group(NamedTuple):
@@ -116,6 +129,10 @@ def left_out(
     failure = None if known else by_chance(observed, posterior, threshold)
     if failure is not None:
         return LeftOut(failure, _rough(observed, posterior) if wide else "")
+    if not known and 2 * found < len(inliers):
+        failure = _reordered(search, observed, WIDEST_GATE * threshold)
+        if failure is not None:
+            return LeftOut(failure)
     # A principal point alone may point to another image.
     most = _BENT_OFF_CENTRE if off_centre(observed.exposure.cameras[0]) else _BENT
     bent = posterior.model_error > most * promised(posterior)
@@ -143,7 +160,8 @@ def left_out(
         # A part is one thing, however many of its landmarks a frame shows: either may have moved.
         moment = np.outer(step, step) + second.covariance
         other = size / (found + size) * moment[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
-        return LeftOut(None, f"{text}: have these points been moved, or do they move?", other)
+        text = f"{text}: have these points been moved, or do they move?"
+        return LeftOut(None, text, other, second.chosen)
     return LeftOut(Failure(
         Reason.MODEL_ERROR,
         f"{text}: which of both is the camera's? A part of the map was moved, or the calibration "
@@ -169,8 +187,37 @@ def _cameras_apart(observed: Observed, inliers: BoolArray, second: _Group, thres
     ) <= np.count_nonzero(inliers[of == place]):
         return ""
     return (
-        f"the points of {exposure.names[place]} have a motion of their own: its extrinsics or its "
-        "clock are others (rs_localizer calibrate --rig)"
+        f"the points of {exposure.names[place]} have a motion of their own: its extrinsics, its "
+        "clock or its K are others (rs_localizer calibrate --rig)"
+    )
+
+
+def _reordered(search: MotionSearch, observed: Observed, gate: float) -> Failure | None:
+    """Return the failure of a frame of markers that fit if their corners come in another order."""
+    seen, usable = observed.observations, observed.usable.indices
+    if len(usable) % 4 or len(usable) < len(observed.points):
+        return None
+    corners = observed.points.reshape(-1, 4, 3)
+    skew = np.linalg.norm(np.einsum("mki,k->mi", corners, _ROUND), axis=1)
+    if np.any(skew > _FLAT * np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)):
+        return None
+    for order in ORDERS:
+        by = np.arange(len(usable)).reshape(-1, 4)[:, order].ravel()
+        part = replace(observed, ranking=observed.ranking[:0], observations=Observations.of(
+            seen.points, seen.rays[by], seen.tau[by], seen.by_ray[by], seen.mounts, seen.camera[by]
+        ))  # fmt: skip
+        fit = search.from_rough(part, search.rough(part))
+        if fit.found and np.mean(part.observations.within(fit.state, gate)) > _FIT:
+            return Failure(Reason.CALIBRATION, f"the points fit if {in_order(order)}")
+    return None
+
+
+def in_order(order: tuple[int, ...]) -> str:
+    """Say in which order corners of markers come that fit in this one."""
+    names = ", ".join(_CORNERS[order.index(k)] for k in range(4))
+    return (
+        f"corners of markers come in another order: where {', '.join(_CORNERS)} belong, {names} "
+        "stand"
     )
 
 

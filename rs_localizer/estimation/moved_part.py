@@ -23,7 +23,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
 from rs_localizer.core.shake import shake_at
-from rs_localizer.core.state import MOVE, PARAMETERS, rotation_of
+from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, rotation_of
 from rs_localizer.estimation.hypotheses import Posterior
 from rs_localizer.estimation.linear_fit import ORDINARY, known_at, smooth_columns
 from rs_localizer.estimation.points import Observed
@@ -137,27 +137,46 @@ class MovedParts:
         """The part that was last found; None: the frames that were last compared show none."""
         self.named: MovedPart | None = None
         """The part that frames show together: one alone may have a cause of its own."""
+        self._apart = np.zeros((0, 3)), np.zeros((MOTION_PARAMETERS,) * 2)
         self._looks: list[Look] = []
         self._count, self._next = 0, 1
 
-    def add(self, look: Callable[[], Look], alike: Callable[[], bool]) -> None:
-        """Take an accepted frame, and whether errors of neighbours in it are alike."""
+    def add(
+        self, look: Callable[[], Look], alike: Callable[[], bool], points: Array, inliers: BoolArray
+    ) -> None:
+        """Take an accepted frame of points (n,3), and whether errors of neighbours are alike."""
+        stays = self.part is not None and _mostly_out(self.part.points, points, inliers)
         self._count += 1
         if not self._looks:
             if self._count < self._next:
                 return
             self._next += min(self._count, _RARELY)
             if not alike():
-                self.part = self.named = None
+                if not stays:
+                    self.part = self.named = None
                 return
         self._looks.append(look())
         if len(self._looks) in (1, _LOOKS):
             found = moved_part(self._looks, self._map_deviation)
-            if found is not None or len(self._looks) == _LOOKS:
+            if found is not None or (len(self._looks) == _LOOKS and not stays):
                 self.part = found
         if len(self._looks) == _LOOKS:
             self.named = found
             self._later()
+
+    def beside(self, group: BoolArray, moment: Array, points: Array, inliers: BoolArray) -> Array:
+        """Return the second moment (12,12) of the motion of left-out points, also if seen before.
+
+        A part is one thing, also where too few of its landmarks are in view to have a motion.
+
+        Args:
+            group: (n,) of the points (n,3) those that have one; none: no others are found.
+            moment: their own, in the map's axes, as the result is.
+        """
+        if group.any():
+            self._apart = points[group], moment
+        there, moment = self._apart
+        return moment if _mostly_out(there, points, inliers) else np.zeros_like(moment)
 
     def discard(self) -> None:
         """Take nothing that was found for a part: the shutter is another one, or may be."""
@@ -167,6 +186,12 @@ class MovedParts:
     def _later(self) -> None:
         self._looks.clear()
         self._next = self._count + min(self._count, _RARELY)
+
+
+def _mostly_out(landmarks: Array, points: Array, inliers: BoolArray) -> bool:
+    """Return whether of some landmarks more are left out than are inliers of points (n,3)."""
+    here = np.isin(points @ _KEY, landmarks @ _KEY)
+    return bool(2 * np.count_nonzero(here & inliers) < np.count_nonzero(here))
 
 
 def neighbours_alike(observed: Observed, posterior: Posterior) -> bool:

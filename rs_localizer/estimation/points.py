@@ -211,6 +211,10 @@ class Observations:
     def __len__(self) -> int:
         return self.count
 
+    def lens_of(self, lenses: IntArray | None) -> IntArray | None:
+        """Return which camera of a rig sees each point (n,), by that of each side; None: one."""
+        return None if lenses is None else lenses[self.camera]
+
     def squared_errors(self, state: Array) -> Array:
         """Return squared reprojection errors (n,) in raw pixels."""
         errors: Array = squared_errors(self.packed, self.count, state)

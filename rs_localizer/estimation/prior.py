@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig, RefinementKind
-from rs_localizer.core.arrays import Array, Array1, Array2, Array3, Out
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3, IntArray, Out
 from rs_localizer.core.camera import numbers
 from rs_localizer.core.rig import Rig
 from rs_localizer.core.rotation_prior import ROTATION, RotationPrior
@@ -456,7 +456,7 @@ class Assumed:
     focal_length: float  # px
     may_rest: bool  # nothing speaks for a motion but the points
     rolling: bool  # velocities are estimated
-    one_lens: bool = True  # of two lenses a smooth error is not one polynomial
+    lenses: IntArray | None = None  # (k,) camera of each side of a rig; None: one camera
     of_rest: float = 0.0  # logarithm of the odds for rest, beside those of any camera
     of_vibration: Array = field(default_factory=np.zeros(0).copy)  # see Prior
     noise: float = math.inf  # px, of its half-normal prior

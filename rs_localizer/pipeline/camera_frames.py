@@ -246,7 +246,8 @@ class CameraFrames(FrameLocalizer):
         self, cloud: Correspondences, result: Estimate | Failure, moment: PublishedMoment
     ) -> Localized | Refusal:
         """Return a result of the body at the published moment."""
-        if self._tracker.lens.fault and not self._scale_is_odd:
+        # A part of the map that lies elsewhere leaves smooth errors, too.
+        if self._tracker.lens.fault and not (self._scale_is_odd or self._tracker.moved):
             self._notice(Notice.LENS, self._tracker.lens.fault)
         if not result:
             return Refusal(result.reason, result.detail)

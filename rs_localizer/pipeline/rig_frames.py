@@ -322,6 +322,8 @@ class RigFrames(FrameLocalizer):
                 Notice.EXTRINSICS,
             )
         assert isinstance(result, RigEstimate)
+        if fault := self._tracker.cameras.fault:
+            self._notice(Notice.EXTRINSICS, fault)
         self._landmarks.lacking = False  # who sends correspondences needs none
         return self._localized(images, result, origin_ns)
 

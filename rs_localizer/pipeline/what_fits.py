@@ -18,6 +18,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.reasons import Notice, Reason
+from rs_localizer.estimation.left_out import ORDERS, in_order
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.outputs import Localized
 from rs_localizer.localizer import Localizer
@@ -70,14 +71,6 @@ def _reordered(order: tuple[int, ...], frame: _Frame) -> Array | None:
     return np.where(whole[:, None], frame.pixels[others], np.nan) if whole.any() else None
 
 
-# The other orders in which four corners may be given; ours.
-_ORDERS = [
-    tuple((first + step * k) % 4 for k in range(4))
-    for step in (1, -1)
-    for first in range(4)
-    if (first, step) != (0, 1)
-]
-_CORNERS = ("upper left", "upper right", "lower right", "lower left")
 _MIRRORED = (
     "pixels are mirrored, left to right or top to bottom: the sender mirrors them (or the map is "
     "left-handed)"
@@ -90,16 +83,7 @@ _OF_IMAGES = [
     (_MIRRORED, _upside_down),
     ("u and v are exchanged: u counts columns, v rows", _exchanged),
 ]
-_REORDERED = "corners of markers come in another order: where {} belong, {} stand"
-_OF_CORNERS = [
-    (
-        _REORDERED.format(
-            ", ".join(_CORNERS), ", ".join(_CORNERS[order.index(k)] for k in range(4))
-        ),
-        partial(_reordered, order),
-    )
-    for order in _ORDERS
-]
+_OF_CORNERS = [(in_order(order), partial(_reordered, order)) for order in ORDERS]
 
 
 def what_fits(

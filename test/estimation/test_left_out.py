@@ -224,3 +224,17 @@ def test_a_fast_camera_may_leave_out_a_few_points_that_lie_near():
         points, pixels = points[seen], pixels[seen] + random.normal(0.0, 0.3, (seen.sum(), 2))
         pixels[::15] += random.uniform(-30.0, 30.0, (len(pixels[::15]), 2))
         assert rsl.Localizer(camera).localize(points, pixels)
+
+
+@pytest.mark.parametrize("order", [[1, 2, 3, 0], [2, 3, 0, 1]])
+def test_corners_of_markers_in_another_order_have_no_pose(order):
+    """Nobody says which points are a marker's: four in a row that are a square."""
+    random, said = np.random.default_rng(5), []
+    for _ in range(8):
+        camera, points, pixels, _ = frame("markers", "right", random)
+        if len(points) == 40:  # all of each marker
+            turned = pixels.reshape(-1, 4, 2)[:, order].reshape(-1, 2)
+            result = rsl.Localizer(camera).localize(points, turned)
+            assert not result
+            said.append("come in another order" in result.detail)
+    assert any(said)

@@ -111,3 +111,11 @@ def test_a_global_shutter_is_no_part_of_a_map():
             tracker.localize(10**9 + round(1e9 * t), points, noisy)
             named += tracker.moved is not None
     assert named == 0
+
+
+def test_a_part_of_which_few_landmarks_are_shown_still_counts():
+    """Too few to have a motion of their own, after frames that show more of them."""
+    (kind,) = (each for each in kinds.kinds() if each.name == "half map moved 50 cm, room")
+    found = kinds.judged(kind, 1)
+    assert found.published > 40
+    assert found.beyond == 0
