@@ -109,8 +109,14 @@ class LensWatch:
         if self._together is None or self._together.other is None:
             return given
         _, deviations = self._together.other
-        length, aspect = np.hypot(deviations, [given.focal_length, given.aspect_ratio]).tolist()
-        return replace(given, focal_length=min(length, 1.0), aspect_ratio=min(aspect, 1.0))
+        usual = given.focal_length, given.aspect_ratio, given.principal_point
+        length, aspect, centre = np.hypot([*deviations[:2], deviations[2:].max()], usual).tolist()
+        return replace(
+            given,
+            focal_length=min(length, 1.0),
+            aspect_ratio=min(aspect, 1.0),
+            principal_point=centre,
+        )
 
     def errors_of(self, declared: ErrorModes | None) -> LandmarkErrors | None:
         """Return errors that landmarks share: those declared, and a stretch if frames show one."""
@@ -127,7 +133,7 @@ class LensWatch:
         """
         if not (self._other and self._exposure and self._together) or self.refusal:
             return found
-        camera, (length, aspect) = self._other.camera, self._together.doubt.tolist()
+        camera, (length, aspect) = self._other.camera, self._together.doubt[:2].tolist()
         (given,) = self._exposure.cameras
         axis = int(camera.scan_direction not in VERTICAL)
         depth = float(np.median(points @ found.rotation[2])) + found.translation[2]

@@ -174,8 +174,25 @@ def test_a_wrong_lens_before_a_wall_is_no_part_of_it_that_moved():
     assert all("a focal length 1.2" in each for each in said[8:]), said
 
 
+@pytest.mark.parametrize("across", [0.0, 70.0])
+def test_another_principal_point_before_a_wall_is_named(across):
+    random = np.random.default_rng(1)
+    camera = camera_of(TRUE)
+    K = camera.K.copy()
+    K[0, 2] += across
+    tracker = Tracker(rsl.Localizer(replace(camera, K=K)))
+    wall = np.column_stack([random.uniform(-1.0, 1.0, (60, 2)) * [1.1, 0.7], np.zeros(60)])
+    moved = np.r_[0.0, 0.0, 2.0, 0.5, 0.2, 0.0, 0.3, 0.2, 0.1, 0.6, 0.6, 0.3]
+    for k in range(24):
+        pixels = moving_board(wall, moved, k / 30 - 0.4)
+        pixels += random.normal(0.0, 0.1, pixels.shape)
+        tracker.localize(10**12 + 33_333_333 * k, wall, pixels)
+    fault = tracker.lens.fault
+    assert re.search(r"a principal point -[67]\d, ", fault) if across else not fault, fault
+
+
 @pytest.mark.parametrize("share", [0.6, 0.8, 1.25])
-def test_poses_allow_for_a_focal_length_that_frames_doubt(share):
+def test_poses_allow_for_a_matrix_that_frames_doubt(share):
     """From there on no pose is beyond five deviations, and few are outside their regions."""
     random = np.random.default_rng(1)
     camera = camera_of(TRUE)
@@ -199,6 +216,7 @@ def test_poses_allow_for_a_focal_length_that_frames_doubt(share):
         far.append(off @ np.linalg.solve(found.covariance[:6, :6], off))
     assert max(far, default=0.0) < 42.0, far  # five deviations of six numbers
     assert np.quantile(far, 0.75) < 12.6 if far else tracker.lens.refusal, far
+    assert tracker.lens.doubted
 
 
 @pytest.mark.parametrize("seed", [1, 2])

@@ -84,7 +84,9 @@ _CUBIC, _OF_CHANGE, _LIKE_MOTION = (-2.0, 1.0, -2.0), 0.15, 0.002
 _READOUT, _LENGTH, _RATIO, _LENS, _MAP = 0, 1, 2, slice(3, 6), slice(6, 11)
 _ANY = (3.0, 0.5, 0.1)
 _BENT, _SHARED, _STRETCHED = 0.003, 11, slice(9, 11)
-_OF_K = slice(_LENGTH, _RATIO + 1)
+# The principal point is as known as lenses are, unless frames tell another one.
+_CENTRE, _ANY_CENTRE = slice(3, 5), 50.0
+_OF_K = slice(_LENGTH, _CENTRE.stop)
 # Landmarks farther away than this many extents are moved like those there.
 _FAR = 2.0
 # Focal length and fy over fx are others than K's beyond so many deviations. Beyond the second they
@@ -134,10 +136,14 @@ class Matrix(NamedTuple):
 
     focal_length: float  # over K's
     aspect_ratio: float  # fy over fx, over K's
+    across: float  # px, of the principal point beside K's
+    down: float
 
     def __str__(self) -> str:
-        names = zip(("a focal length", "fy over fx"), self, strict=True)
+        names = zip(("a focal length", "fy over fx"), self[:2], strict=True)
         named = [f"{name} {value:.3g} times K's" for name, value in names if value != 1.0]
+        if self.across or self.down:
+            named.append(f"a principal point {self.across:.0f}, {self.down:.0f} px from K's")
         return (
             f"successive images fit a camera with {' and '.join(named)}: is K that of another "
             "resolution or of a zoomed, squeezed or rectified image, was only its size edited, or "
@@ -448,8 +454,9 @@ class FramesTogether:
         self._exposure, self._map_deviation = exposure, config.map_deviation
         self._most_variance = config.inlier_threshold**2
         self._of_lens = given.principal_point, given.principal_point, given.distortion
+        centre = math.hypot(_USUAL * exposure.cameras[0].focal_length, given.principal_point)
         usual = math.hypot(_USUAL, given.focal_length), max(given.aspect_ratio, _EXACT)
-        self._usual = np.array(usual)
+        self._usual = np.array([*usual, centre, centre])
         self._threes: list[_Three] = []
         self._map: _Landmarks | None = None
         self._known = np.zeros(_SHARED)  # before any frame, as information
@@ -459,10 +466,11 @@ class FramesTogether:
         """The matrix that frames tell to be the camera's instead of K; None: K may be right."""
         self.stretch: Stretch | None = None
         """How frames show the map to be stretched; None: by no more than chance."""
-        self.doubt = np.zeros(2)
-        """Deviations (logarithms) of focal length and fy over fx from K's, if frames doubt K."""
+        self.doubt = np.zeros(4)
+        """Deviations of focal length and fy over fx (logarithms) and principal point (px) from K's,
+        if frames doubt K."""
         self.other: tuple[Camera, Array] | None = None
-        """The camera that frames then tell, and deviations (2,) of these numbers of it."""
+        """The camera that frames then tell, and deviations (4,) of these numbers of it."""
 
     @property
     def is_enough(self) -> bool:
@@ -481,18 +489,24 @@ class FramesTogether:
         newest = _Three(self._exposure, posed, self._map, before[_LENGTH])
         threes, principal = [*map(copy, self._threes), newest], self._principal
         fit = self._fitted(threes, before, principal)
+        if self._is_off_centre(fit, threes):
+            self._known[_CENTRE] = _ANY_CENTRE**-2.0
+            fit = self._fitted(threes, fit.numbers, principal, self._known)
         if not self._fits(fit, threes):
             fit, threes, principal = self._from_anywhere([three.posed for three in threes])
             if not self._fits(fit, threes):  # it leaves more than frames do
                 return
         if self._beyond(fit, _DOUBTFULLY).any():
             fit, threes, principal = self._beside_k(fit, threes, principal)
+        if not self._beyond(fit, _DOUBTFULLY)[2:].any():
+            self._known[_CENTRE] = np.maximum(self._of_lens[:2], _EXACT) ** -2.0
         self._threes, self._fit, self._principal = threes, fit, principal
         if len(threes) > _KEPT:
             del self._threes[self._least()]
         told = self._beyond(fit, _SURELY, _VIBRATING) > 0.0
-        ratios = np.where(told, np.exp(fit.numbers[_OF_K]), 1.0)
-        self.matrix = Matrix(*ratios.tolist()) if told.any() else None
+        length, aspect, *centre = (told * fit.numbers[_OF_K]).tolist()
+        found = Matrix(math.exp(length), math.exp(aspect), centre[0], centre[1])
+        self.matrix = found if told.any() else None
         doubtful = self._beyond(fit, _DOUBTFULLY) > 0.0
         numbers, deviations = (doubtful * each[_OF_K] for each in (fit.numbers, fit.deviations))
         self.doubt = np.hypot(numbers, deviations)
@@ -505,23 +519,33 @@ class FramesTogether:
         stretch = Stretch(self._map, np.copysign(by_more, sizes), surely)
         self.stretch = stretch if by_more.any() else None
 
-    def _another(self, length: float, aspect: float) -> Camera:
-        """Return the camera with another focal length and fy over fx (logarithms, over K's)."""
+    def _is_off_centre(self, fit: _Fit, threes: Sequence[_Three]) -> bool:
+        """Return whether another principal point may explain the frames, to first order."""
+        known = self._known.copy()
+        known[_CENTRE] = _ANY_CENTRE**-2.0
+        information, slope = _summed(threes, known, fit.numbers)
+        covariance = np.linalg.inv(information)
+        there = (fit.numbers - covariance @ slope)[_CENTRE]
+        deviations = np.hypot(_ALIKE * np.sqrt(np.diag(covariance)[_CENTRE]), self._usual[2:])
+        return bool(np.any(np.abs(there) > _DOUBTFULLY * deviations))
+
+    def _another(self, length: float, aspect: float, *centre: float) -> Camera:
+        """Return the camera with these numbers beside K's, as in ``doubt``."""
         (camera,) = self._exposure.cameras
         K = camera.K.copy()
         K[[0, 1], [0, 1]] *= np.exp(length + aspect * _ASPECT)
-        K[:2, 2] += math.expm1(length) * self._principal * camera.focal_length
+        K[:2, 2] += math.expm1(length) * self._principal * camera.focal_length + centre
         return replace(camera, K=K)
 
     def _beyond(self, fit: _Fit, least: float, wider: float = 1.0) -> Array:
-        """Return what of focal length and fy over fx (2,) lies beyond so many deviations, or 0."""
+        """Return what of the numbers of K (4,) lies beyond so many deviations, or 0."""
         deviations = np.hypot(wider * fit.deviations[_OF_K], self._usual)
         squared = fit.numbers[_OF_K] ** 2 - (least * deviations) ** 2
         # Rows of a squeezed image take as long as before; images that are turned as wholes look
         # squeezed, too. Where rows seem to take another time than is given, a camera that vibrates
         # looks like another focal length.
         longer, aspect = math.log1p(max(fit.numbers[_READOUT], -0.9)), fit.numbers[_RATIO]
-        most = np.array([least * fit.deviations[_READOUT], _TURNED])
+        most = np.array([least * fit.deviations[_READOUT], _TURNED, _TURNED, _TURNED])
         beyond: Array = np.sqrt(np.maximum(squared, 0.0)) * (abs(longer + aspect) < most)
         return beyond
 
@@ -535,7 +559,7 @@ class FramesTogether:
         """
         assert self._map is not None
         known, start = self._known.copy(), fit.numbers.copy()
-        known[_OF_K], start[_OF_K] = self._usual**-2.0, 0.0
+        known[_OF_K], start[_OF_K] = np.maximum(known[_OF_K], self._usual**-2.0), 0.0
         given = [_Three(self._exposure, three.posed, self._map, 0.0) for three in threes]
         with_k = self._fitted(given, start, np.zeros(2), known)
         fit = self._fitted(threes, fit.numbers, principal, self._known)
@@ -590,11 +614,7 @@ class FramesTogether:
         for three in new:
             three.linearize(numbers, principal, least)
         for _ in range(_ROUNDS * len(new) if exactly is None else _EXACT_ROUNDS):
-            information: Array = np.diag(known)
-            slope = known * numbers
-            for there in (three.equations for three in threes if three.equations):
-                information = information + there.information
-                slope = slope + there.slope + there.information @ (numbers - there.numbers)
+            information, slope = _summed(threes, known, numbers)
             try:
                 covariance[:] = np.linalg.inv(information + np.diag(self._known - known))
                 step = -np.linalg.solve(information + _DAMPING, slope)
@@ -730,6 +750,16 @@ class CamerasTogether:
         return texts
 
 
+def _summed(threes: Sequence[_Three], known: Array, numbers: Array) -> tuple[Array, Array]:
+    """Return information (11,11) and slope (11,) of all threes and what is known, there."""
+    information: Array = np.diag(known)
+    slope = known * numbers
+    for there in (three.equations for three in threes if three.equations):
+        information = information + there.information
+        slope = slope + there.slope + there.information @ (numbers - there.numbers)
+    return information, slope
+
+
 def _disagreement(threes: Sequence[_Equations], numbers: Array) -> float:
     """Return by how much threes scatter about common numbers, over what their equations say.
 
@@ -738,11 +768,11 @@ def _disagreement(threes: Sequence[_Equations], numbers: Array) -> float:
     """
     if len(threes) < 2:
         return 1.0
-    some, square = slice(0, _OF_K.stop), 0.0
+    some, square = slice(0, _LENS.start), 0.0
     for there in threes:
         pull = (there.slope + there.information @ (numbers - there.numbers))[some]
         square += float(pull @ np.linalg.pinv(there.information[some, some]) @ pull)
-    return math.sqrt(max(square / (_OF_K.stop * (len(threes) - 1)), 1.0))
+    return math.sqrt(max(square / (_LENS.start * (len(threes) - 1)), 1.0))
 
 
 def _frames(exposure: Exposure, posed: Sequence[Fitted], map_: _Landmarks) -> list[_Linked]:
