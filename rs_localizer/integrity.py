@@ -125,7 +125,7 @@ class SeenLandmarks:
     def add(self, keys: Array, kept: BoolArray) -> None:
         """Count the landmarks of a frame."""
         if len(self._places) > _MOST_LANDMARKS:  # those that are not in view
-            here = [key for key in keys.tolist() if key in self._places]
+            here = [*dict.fromkeys(key for key in keys.tolist() if key in self._places)]
             self._counts = self._counts[[self._places[key] for key in here] + [-1]]
             self._places = {key: place for place, key in enumerate(here)}
         places = self._places
@@ -202,7 +202,7 @@ class Integrity:
 
         Args:
             numbers: of the frame.
-            seconds: since the last frame with a pose.
+            seconds: since the last frame with a pose; infinite: nobody knows.
         """
         said = min(max(float(WEIGHTS[0] + WEIGHTS[1:] @ numbers), -_MOST_ODDS), _MOST_ODDS)
         weight = TEMPER

@@ -123,6 +123,16 @@ def test_landmarks_that_are_never_matched_are_named_and_no_others():
     assert not judge.stale(POINTS + 1.0).any()
 
 
+def test_a_landmark_that_comes_twice_in_an_image_takes_no_place_of_another(monkeypatch):
+    monkeypatch.setattr("rs_localizer.integrity._MOST_LANDMARKS", 5)
+    seen = SeenLandmarks()
+    seen.add(np.arange(10.0), np.arange(10) != 3)
+    for _ in range(30):
+        seen.add(np.array([1.0, 1.0, 2.0, 3.0]), np.array([True, True, True, False]))
+        seen.add(np.array([77.0]), np.array([True]))
+    assert seen.stale(np.array([3.0, 77.0])).tolist() == [True, False]
+
+
 def test_a_landmark_that_has_been_matched_once_is_there():
     seen, keys = SeenLandmarks(), np.arange(10.0)
     assert not seen.stale(keys).any()
