@@ -177,6 +177,7 @@ class Tracker:
         self._integrity = Integrity(localizer.config.acceleration)
         self._parts = MovedParts(localizer.config.map_deviation)
         self._last_ns: int | None = None
+        self._judged_ns: int | None = None
         self._too_close = 0
         if aid is not None:
             self._readout_time = localizer.camera.readout_time
@@ -186,6 +187,7 @@ class Tracker:
         """Forget all frames so far."""
         self._track = self._given = None
         self._integrity.reset()
+        self._judged_ns = None
         self._parts.reset()
         self._seen.clear()
         self._images, self.repeats = RepeatedImages(), False
@@ -540,6 +542,7 @@ class Tracker:
         if isinstance(seen.found, Estimate):
             fitted = seen.found.residuals[seen.found.inliers].max(initial=0.0)
             seen.gate = max(self.localizer.config.inlier_threshold, fitted)
+        seen.points, seen.pixels = _own(seen.points), _own(seen.pixels)
         self._seen.append(seen)
 
     def _again(
@@ -654,7 +657,10 @@ class Tracker:
             return result
         seconds = 0.0 if self._track is None else 1e-9 * (time_ns - self._track.time_ns)
         numbers = self._integrity.numbers(result, points, prior, seconds)
-        return replace(result, integrity=self._integrity.add(numbers, seconds))
+        before, self._judged_ns = self._judged_ns, time_ns  # of images that have no track, too
+        gone = time_ns - before if before is not None else 0
+        later = 1e-9 * gone if gone > 0 else math.inf
+        return replace(result, integrity=self._integrity.add(numbers, later))
 
     def _prior(
         self, time_ns: int, rotation: RotationPrior | None, span: float | None,
@@ -733,6 +739,13 @@ class Tracker:
         added[:, VELOCITIES] *= math.copysign(1.0, dt)
         fading = math.copysign(FADING, dt) / readout_time
         return LastFrame(track.time_ns, motion, covariance, added, fading)
+
+
+def _own(arrays: Any) -> Any:
+    """Return copies of the arrays of a frame: the caller may fill his with the next one."""
+    if isinstance(arrays, Mapping):
+        return {name: [None if x is None else np.array(x) for x in arrays[name]] for name in arrays}
+    return None if arrays is None else np.array(arrays)
 
 
 def _check_motion(localizer: Localizer) -> None:

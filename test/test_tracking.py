@@ -427,6 +427,22 @@ def test_times_in_other_units_are_refused(stamps, pairs):
         tracker.localize(first + pairs * (second - first), points, pixels)
 
 
+def test_images_that_are_seconds_apart_are_judged_too():
+    """None has a track. Without the time since the last one, the first doubt stayed for ever."""
+    tracker, hand = Tracker(rsl.Localizer(CAMERA)), Hand()
+    chances = [tracker.localize(ns(t), *hand.frame(t, 80)).integrity for t in (0.0, 2.0, 4.0)]
+    assert chances[2] < chances[1] < 0.5 * chances[0]
+
+
+def test_a_frame_that_comes_later_is_of_its_own_image_though_arrays_are_used_again():
+    tracker, hand = Tracker(rsl.Localizer(CAMERA), output_lag=2), Hand()
+    points, pixels = np.empty((60, 3)), np.empty((60, 2))
+    for t in times(6):
+        points[:], pixels[:] = hand.frame(t, 60)
+        result = tracker.localize(ns(t), points, pixels)
+    assert result.inliers.mean() > 0.9
+
+
 def test_stamps_of_unsigned_integers_are_those_of_python():
     found = []
     for kind in (int, np.uint64):
