@@ -468,8 +468,7 @@ class ShutterWatch:
             return "reversed"
         if found < -_GLOBAL * usual:  # one of both
             return ""
-        is_new = self.kind != "duration" and found > _GLOBAL * usual
-        if is_new and not self._rotations.are_enough:  # vibration may look like it
+        if not (self.kind or self._rotations.are_enough):  # vibration or a stop may look like it
             return ""
         kind, named = (
             ("global", " (a global shutter)") if found < _GLOBAL * usual else ("duration", "")

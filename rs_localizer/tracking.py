@@ -711,7 +711,9 @@ class Tracker:
         track, share = self._track, self._readout_time_deviation(context) / result.span
         if track is not None and told is not None and self._trusts_motion():
             window = replace(track.window, readout_share=share).joined(told)
-            if window.surprise < _MOST_INNOVATION:  # NaN, of rounding errors, is not
+            # Less than 0, beside rounding errors, is left where the slope of a prior that is far
+            # behind is no Gaussian's. NaN, of rounding errors, is neither.
+            if -1.0 < window.surprise < _MOST_INNOVATION:
                 return window
         config, start = self.localizer.config, gaussian_of(result, time_ns)
         start.covariance[LINEAR, LINEAR] += (_FAST * config.velocity_prior.linear) ** 2 * np.eye(3)

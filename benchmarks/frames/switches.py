@@ -45,7 +45,7 @@ _REFUSAL = "rs_localizer.localizer:refusal"
 SWITCHES: dict[str, tuple[Switch, ...]] = {
     # Blocks of the model.
     "smooth-error": (
-        Switch(f"{_FRAME}:smooth_error",
+        Switch(f"{_FRAME}:smooth_errors",
                lambda old: lambda lines, inliers, *_: nothing_shared(int(inliers.sum()))),
     ),
     "in-frame-turn": (

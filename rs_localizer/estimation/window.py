@@ -93,8 +93,6 @@ _GROWN, _ODDS, _RECENT = (1.0, 3.0, 10.0), math.log(20.0), 3
 _SWINGS, _SLOW = (0.01, 0.03, 0.1, 0.3), 0.15
 # Who turns about one axis turns a little about the others: of the largest deviation.
 _LEAST_SHARE = 0.3
-# Deviations between points and prior, along each axis: more are no Gaussians.
-_MOST_APART = 8.0
 # Derivatives of a motion without its vibration by motion and coefficients.
 _UNSHAKEN = np.eye(PARAMETERS, PARAMETERS + 3 * len(MIDDLE_VALUES))
 _UNSHAKEN[TURN, PARAMETERS:] = -np.kron(MIDDLE_VALUES, np.eye(3))
@@ -521,17 +519,10 @@ def _score(
 
 
 @entry
-def _told_by_points(covariance: Array2, known: Array2, slope: Array1) -> tuple[Array, Array]:
-    """Return the information (18,18) of a posterior beyond its prior, and its gradient (18,).
+def _told_by_points(covariance: Array2, known: Array2) -> Array:
+    """Return the information (18,18) of a posterior beyond its prior.
 
-    By the eigenvalues of what was known, in units of the posterior: none of them exceeds 1. Where
-    points tell little, the slope of a prior that the motion has left far behind would be a step
-    without bounds: it counts as one of so many deviations between points and prior.
-
-    Args:
-        covariance: (18,18) of the posterior.
-        known: (18,18) information of the prior.
-        slope: (18,) gradient of the prior at the posterior's mean.
+    By the eigenvalues of what was known, in units of the posterior: none of them exceeds 1.
     """
     whole = inverted(covariance)
     scale = np.sqrt(np.diag(whole))
@@ -540,12 +531,10 @@ def _told_by_points(covariance: Array2, known: Array2, slope: Array1) -> tuple[A
     back = np.linalg.inv(factor)
     part = back @ (known / units) @ back.T
     values, vectors = np.linalg.eigh(0.5 * (part + part.T))
-    told = np.maximum(1.0 - values, 0.0)
-    axes = np.ascontiguousarray(factor) @ np.ascontiguousarray(vectors)
-    half, most = axes * np.sqrt(told), _MOST_APART * np.sqrt(told * np.maximum(values, 0.0))
-    pulls = np.ascontiguousarray(vectors.T) @ (np.ascontiguousarray(back) @ (slope / scale))
-    gradient = scale * (axes @ np.minimum(np.maximum(pulls, -most), most))
-    return (half @ half.T) * units, gradient
+    roots = np.ascontiguousarray(vectors * np.sqrt(np.maximum(1.0 - values, 0.0)))
+    half = np.ascontiguousarray(factor) @ roots
+    told: Array = (half @ half.T) * units
+    return told
 
 
 def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array, Array]:
@@ -598,7 +587,7 @@ def told_of(
     if rotation is not None:
         state[STATE_ANGULAR] += rotation.smooth_rate
         state[STATE_ANGULAR_ACCELERATION] += rotation.change
-    told = MotionSample(time_ns, state, *_told_by_points(covariance, information, slope))
+    told = MotionSample(time_ns, state, _told_by_points(covariance, information), slope)
     return told.over(1.0 / estimate.span)
 
 
