@@ -275,6 +275,26 @@ def test_no_input_crashes_or_warns(solver, points, pixels):
         assert np.isfinite(result.rotation).all()
 
 
+def test_points_on_a_line_leave_no_rotation_that_is_none():
+    """Some of them had rotations with entries of 1e13 and more."""
+    rng = np.random.default_rng(0)
+    along = rng.uniform(-0.4, 0.4, 60)
+    line = np.column_stack([along, 0.75 * along, np.full(60, 1.2)])
+    pixels = shown(
+        TRUE,
+        lambda after: (
+            Rotation.identity(len(np.atleast_1d(after))),
+            np.zeros((len(np.atleast_1d(after)), 3)),
+        ),
+        line,
+    )
+    for seed in range(600):
+        noise = 0.4 * np.random.default_rng(seed).normal(size=pixels.shape)
+        found = rsl.Localizer(camera()).localize(line, pixels + noise)
+        if found:
+            np.testing.assert_allclose(found.rotation @ found.rotation.T, np.eye(3), atol=1e-6)
+
+
 @pytest.mark.parametrize("distinct", [6, 20])
 def test_copies_of_points_are_no_further_evidence(distinct):
     points, pixels, _ = frame(Path(), count=distinct, noise=1.0)

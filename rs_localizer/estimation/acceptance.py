@@ -43,6 +43,8 @@ MOST_TURN = 0.07
 # hand-held boards of 12 to 20 cm come to 1.5 times (benchmarks.real), and beyond three a covariance
 # no longer says where a pose on an arc may be.
 _OPEN = 3.0
+# Rotations are orthonormal to this, also where thousands of steps have rounded them.
+_ROUNDED = 1e-6
 # Points that lie closer together than this (px) show no perspective.
 _LEAST_EXTENT = 5.0
 
@@ -92,7 +94,9 @@ def refusal(
             f"{found} inliers do not determine the motion: smallest eigenvalue of the scaled "
             f"information {posterior.smallest_eigenvalue:.1e}",
         )
-    if not (np.isfinite(posterior.state).all() and np.isfinite(posterior.covariance).all()):
+    turn = rotation_of(posterior.state)  # none, where points on a line let it run away
+    finite = np.isfinite(posterior.state).all() and np.isfinite(posterior.covariance).all()
+    if not (finite and np.allclose(turn @ turn.T, np.eye(3), atol=_ROUNDED)):
         return Failure(
             Reason.DEGENERATE,
             f"{found} inliers leave the motion so open that it cannot be computed",
