@@ -282,7 +282,7 @@ class Exposure:
 
     @property
     def lenses(self) -> IntArray | None:
-        """Which of several cameras each side (k,) is of; None: there is one."""
+        """Return the place of the camera of each side (k,); None if there is only one camera."""
         return None if self.alone else np.array([side.place for side in self.sides])
 
     def ahead(self, pixels: Array | None = None) -> Exposure:
