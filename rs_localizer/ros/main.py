@@ -43,7 +43,7 @@ _PROGRAMS = {
 }
 
 
-class UsageError(Exception):
+class CommandLineError(Exception):
     """Some argument is neither for ROS nor known."""
 
 
@@ -55,7 +55,7 @@ def answer(name: str, words: Sequence[str]) -> str | None:
         words: arguments of the command line.
 
     Raises:
-        UsageError: an argument is neither for ROS nor known.
+        CommandLineError: an argument is neither for ROS nor known.
     """
     own, for_ros = [], False
     for word in words:
@@ -67,7 +67,7 @@ def answer(name: str, words: Sequence[str]) -> str | None:
     if any(word in _HELP for word in own):
         return _help(name)
     if own:
-        raise UsageError(
+        raise CommandLineError(
             f"unknown arguments: {' '.join(own)}. Parameters and remappings follow "
             f"{_ROS_ARGUMENTS}: see ros2 run rs_localizer {name} --help"
         )
@@ -117,7 +117,7 @@ def _run(name: str, args: list[str] | None = None) -> int:
         except ImportError as error:
             sys.stderr.write(f"{name}: {explain(error)}\n")
             return 1
-        except UsageError as error:
+        except CommandLineError as error:
             sys.stderr.write(f"{name}: {error}\n")
             return 2
         code: int = make(stop, args)

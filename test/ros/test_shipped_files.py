@@ -293,6 +293,8 @@ def test_only_what_is_for_ros_is_handed_on():
         assert main.answer("localizer", words.split()) is None
     assert "usage" in str(main.answer("localizer", ["--ros-args", "-p", "a:=1", "--", "--help"]))
     for words in ("--badarg", "imu:=/imu", "--ros-args -p a:=1 -- --badarg"):
-        with pytest.raises(main.UsageError, match=f"unknown arguments: {words.split()[-1]}. Param"):
+        with pytest.raises(
+            main.CommandLineError, match=f"unknown arguments: {words.split()[-1]}. Param"
+        ):
             main.answer("localizer", words.split())
     assert main.main(["--badarg"]) == 2
