@@ -23,7 +23,6 @@ from benchmarks.experiments import (
     linearisation,
     motion,
     noise,
-    readout_time,
     sequences,
     timings,
     translation,
@@ -42,20 +41,18 @@ EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
     "from-p3p": from_p3p.run,
     "sequences": sequences.run,
     "timings": timings.run,
-    "readout-time": readout_time.run,
 }
 
 _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   frames                           regions, errors and times of frames; two versions compared
   integrity                        the chance of a wrong pose or map: reliability, ROC
-  rigs                             several cameras, against their bounds
+  rigs                             several cameras, one of them wrong
   real                             videos of real cameras; real gyro BAG: before a gyroscope
   faulty_gyroscopes                gyroscopes that are wrong, beside the camera alone
   kinds                            faults that no frame's model has: what is noticed
   mapping                          refined maps and surveyed markers
   fuzzing                          wrong input for everything that reads
   load                             live nodes under load
-  load.robot                       a live node on a robot: occlusions, trouble
   page                             what a bench prints, into the docs
 """
 
@@ -78,7 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )  # fmt: skip
     parser.add_argument(
         "--trials", type=int, default=2000, metavar="N",
-        help="simulated frames per point of a curve; recordings and timings are cut in proportion "
+        help="simulated frames per point of a curve; timings are cut in proportion "
         "(default: %(default)s, some minutes)",
     )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="of all random numbers (default: 0)")

@@ -472,12 +472,6 @@ class NodeConfig(LocalizerConfig):
         "stamped into the future, in s",
         (0.0, 10.0),
     )
-    saved_pose_file: str = setting(
-        "",
-        "File that keeps the last pose of map_to_odom; the node starts from it as from a click; "
-        "empty: none",
-        fixed=True,
-    )
     camera_file: str = setting(
         "",
         "File of a camera by calibrate; its lens replaces that of camera_info, its settings count "
@@ -527,8 +521,6 @@ class NodeConfig(LocalizerConfig):
                 raise ValueError(f"{name} must not be empty")
         if self.base_frame == self.odom_frame:
             raise ValueError(f"base_frame and odom_frame are both {self.odom_frame!r}")
-        if self.saved_pose_file and self.tf_rate == 0.0:  # as its timer saves, and starts
-            raise ValueError("saved_pose_file needs a tf_rate above 0")
 
     @property
     def shutters(self) -> Mapping[str, CameraSettings]:

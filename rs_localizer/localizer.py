@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig, RefinementKind, localizer_config
-from rs_localizer.core.arrays import Array, instance
+from rs_localizer.core.arrays import Array, instance, real
 from rs_localizer.core.bearings import seen_at
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
@@ -229,8 +229,9 @@ class Localizer:
         if prior is not None:
             instance("prior", prior, Prior)
             self._check_rate(prior)
-        if not 0.0 <= expected_share <= 1.0:
-            raise ValueError(f"expected_share must lie between 0 and 1, got {expected_share}")
+        if rotation is not None:
+            instance("rotation", rotation, RotationPrior)
+        real("expected_share", expected_share, "between 0 and 1", 0.0, 1.0)
         sights = self._sights(points, pixels, scores, stamps)
         given = _Inputs(*sights, prior, expected_share, rotation, error_modes, parts)
         if rotation is not None and not given.exposure.alone:

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.config import Acceleration, CalibrationErrors, RefinementKind
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array, BoolArray, instance
+from rs_localizer.core.arrays import Array, BoolArray, instance, real, whole_ns
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import ByCamera, Rig, RigEstimate
 from rs_localizer.core.rotation_prior import RotationPrior
@@ -153,14 +153,15 @@ class Tracker:
         max_prediction: float = 0.1,
     ) -> None:
         instance("localizer", localizer, Localizer)
+        if aid is not None:
+            instance("aid", aid, Aid)
         if remembers_motion:
             _check_motion(localizer)
         elif aid is not None:
             aid.forget_delay()
         if output_lag not in range(LENGTH):
             raise ValueError(f"output_lag must be 0 to {LENGTH - 1} frames, got {output_lag!r}")
-        if not 0.0 <= max_prediction < math.inf:
-            raise ValueError(f"max_prediction must be 0 s or more, got {max_prediction!r}")
+        real("max_prediction", max_prediction, "0 s or more", 0.0)
         self.localizer, self.remembers_motion = localizer, remembers_motion
         self._allowing = localizer  # for a camera matrix that frames doubt
         self.output_lag, self.max_prediction = int(output_lag), max_prediction
@@ -258,23 +259,15 @@ class Tracker:
         )
 
     def _checked(self, time_ns: int) -> int:
-        """Return a time as Python's integer; ``ValueError``: it cannot be in nanoseconds.
-
-        Differences of NumPy's unsigned integers would wrap around.
-        """
-        if isinstance(time_ns, bool) or not isinstance(time_ns, (int, np.integer)):
-            raise ValueError(
-                f"time_ns must be a whole number of nanoseconds, got {time_ns!r} "
-                f"({type(time_ns).__name__}): round(1e9 * seconds)"
-            )
-        time_ns = int(time_ns)
+        """Return a time as Python's integer; ``ValueError``: it cannot be in nanoseconds."""
+        time_ns = whole_ns(time_ns)
         before, self._last_ns = self._last_ns, time_ns
         step = _LEAST_STEP_NS if before is None else time_ns - before
         self._too_close = self._too_close + 1 if 0 < step < _LEAST_STEP_NS else 0
         # One pair is enough for seconds or milliseconds since 1970, or milliseconds since the
-        # start.
+        # start, of images within ten seconds: nanoseconds since the boot can look alike.
         coarse = time_ns < _COUNTED or any(low <= time_ns < high for low, high in _SINCE_1970)
-        if self._too_close >= (1 if coarse else _MOST_TOO_CLOSE):
+        if self._too_close >= (1 if coarse and step < 10_000 else _MOST_TOO_CLOSE):
             raise ValueError(
                 f"frames are {step} ns apart: time_ns is in nanoseconds, 1e9 of a second, 1e6 of "
                 "a millisecond and 1e3 of a microsecond"
@@ -286,7 +279,8 @@ class Tracker:
 
         It is ignored if the frames before predict the motion, which they know better.
         """
-        self._given = int(time_ns), prior
+        instance("prior", prior, Prior)
+        self._given = whole_ns(time_ns), prior
 
     def prediction(
         self, time_ns: int, span: float | None = None, context: FrameContext = ORDINARY
@@ -295,7 +289,7 @@ class Tracker:
 
         ``span`` is the time (s) of the frame's rows; None: that of the last frame.
         """
-        track, time_ns = self._track, int(time_ns)
+        track, time_ns = self._track, whole_ns(time_ns)
         if track is None or not self._follows(time_ns):
             given = self._given
             return given[1] if given is not None and given[0] == time_ns else None
@@ -318,7 +312,7 @@ class Tracker:
             readings: of the aid, from before the last frame with a pose until now; after that
                 frame, the camera rotates as they say.
         """
-        track, time_ns = self._track, int(time_ns)
+        track, time_ns = self._track, whole_ns(time_ns)
         if track is None:
             return None
         # Of frames that failed since there may be more than are kept.
@@ -424,6 +418,7 @@ class Tracker:
                 the time of the estimate counts from there, too.
             context: what else is known of this frame.
         """
+        instance("context", context, FrameContext)
         later, span = 0, None
         if isinstance(points, Mapping) and points:
             exposure = self.localizer.rig.exposure(tuple(points), stamps)

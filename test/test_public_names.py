@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import rs_localizer as rsl
@@ -45,3 +46,24 @@ def test_programs_start_with_light_imports(module):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("said", "call"),
+    [
+        ("roi.width must be a whole", lambda localizer: rsl.Roi(0, 0, "5", 5)),
+        ("expected_share must be be", lambda it: it.localize([], [], expected_share="0.5")),
+        ("rotation must be of type R", lambda it: it.localize([], [], rotation=3)),
+        ("aid must be of type Aid, g", lambda localizer: rsl.Tracker(localizer, aid=5)),
+        ("max_prediction must be 0 s", lambda it: rsl.Tracker(it, max_prediction="1")),
+        ("time_ns must be a whole nu", lambda localizer: rsl.Tracker(localizer).at(None)),
+        ("prior must be of type Prio", lambda localizer: rsl.Tracker(localizer).expect(0, 3)),
+        ("context must be of type Fr", lambda it: rsl.Tracker(it).localize(0, [], [], context=3)),
+        ("iterations must be 1 or mo", lambda it: rsl.solve_minimal(
+            "p3p", np.zeros((1, 3, 3)), np.zeros((1, 3, 2)), np.zeros((1, 3)), iterations="x")),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_meant_is_refused_by_its_name(said, call):
+    K = [[500, 0, 320], [0, 500, 240], [0, 0, 1]]
+    with pytest.raises(ValueError, match=f"^{said}"):
+        call(rsl.Localizer(rsl.Camera(640, 480, K, readout_time=0.03)))

@@ -427,6 +427,12 @@ def test_times_in_other_units_are_refused(stamps, pairs):
         tracker.localize(first + pairs * (second - first), points, pixels)
 
 
+def test_images_that_are_microseconds_apart_by_a_clock_since_the_boot_are_no_other_unit():
+    tracker = Tracker(rsl.Localizer(CAMERA))
+    for since_boot in (2_000_000_000, 2_000_060_000):
+        assert tracker.localize(since_boot, *Hand().frame(0.0, 40))
+
+
 def test_images_that_are_seconds_apart_are_judged_too():
     """None has a track. Without the time since the last one, the first doubt stayed for ever."""
     tracker, hand = Tracker(rsl.Localizer(CAMERA)), Hand()

@@ -3,7 +3,6 @@
 """``python -m benchmarks.real FOLDER``: real videos of boards, together; each in OUT/real.csv.
 
 ``python -m benchmarks real gyro BAG``: turn rates before a gyroscope, of your own recording.
-``python -m benchmarks real aria FOLDER``: a head's real motion before its room's points.
 
 FOLDER holds videos and ``index.csv``, a line for each: file, inner corners, side of a square (m),
 as ``walk.mp4,8x6,0.025``. Settings of the method as everywhere: ``-p map_deviation:=0.0005``.
@@ -20,22 +19,21 @@ from pathlib import Path
 from statistics import median
 
 from benchmarks.experiments.results import Table, rounded
-from benchmarks.real import gyro, motion
+from benchmarks.real import gyro
 from benchmarks.real.clips import clips_of, opencv_lens, shutter_of
 from benchmarks.real.judging import METHODS, judged
 from benchmarks.real.peers import PEERS
 from benchmarks.real.recordings import add_settings
 from rs_localizer.cli.settings_args import given_settings
 
-JUDGES = {"gyro": gyro.main, "aria": motion.main}
-"""Beside the boards, by the first argument."""
-
 
 def main(argv: Sequence[str]) -> int:
     """Run it; the exit code: 0 done, 1 the recording cannot be used, 2 wrong usage."""
     try:
-        judge = JUDGES.get(argv[0], boards) if argv else boards
-        judge(argv[1:] if judge is not boards else argv)
+        if argv and argv[0] == "gyro":
+            gyro.main(argv[1:])
+        else:
+            boards(argv)
     except (ValueError, OSError) as error:
         sys.stderr.write(f"python -m benchmarks real: {error}\n")
         return 1

@@ -25,7 +25,6 @@ from matplotlib.figure import Figure
 
 from benchmarks.experiments.results import Table
 from benchmarks.real.gyroscopes import Gyroscope, aligned, best_offset, in_images
-from benchmarks.real.motion import AHEAD
 from benchmarks.real.peers import PEERS, GlobalPose, solve_pnp_ransac
 from benchmarks.real.recordings import Recording, add_settings, read_bag
 from rs_localizer.cli.settings_args import given_settings
@@ -41,6 +40,7 @@ from rs_localizer.tracking import Tracker
 _INSIDE = 7.815  # 95 % quantile of chi-squared with three degrees of freedom
 _QUANTILE = 1.96  # of a normal number, both sides of 95 %
 _NEAR = 1.0  # px
+_AHEAD = (0.01, 0.03, 0.1)  # s after the middle of an image, for which the tracker is asked
 _FASTEST = 15  # images
 _NS = 1e-9
 _MOMENT = 0.002  # s, half of what counts as one
@@ -138,7 +138,7 @@ def _row(
 def predicted(recording: Recording, gyroscope: Gyroscope, config: LocalizerConfig) -> list[str]:
     """Lines of turn rates that ``Tracker.at`` predicts, before those of that moment."""
     tracker = Tracker(Localizer(recording.camera, config))
-    errors: dict[float, list[tuple[Array, Array]]] = {ahead: [] for ahead in AHEAD}
+    errors: dict[float, list[tuple[Array, Array]]] = {ahead: [] for ahead in _AHEAD}
     for each in recording.frames:
         tracker.localize(each.middle_ns, each.points, each.pixels)
         for ahead, of in errors.items():

@@ -1,7 +1,8 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The kinds of arrays that pass through the package, and a check of what callers pass."""
+"""The kinds of arrays that pass through the package, and checks of what callers pass."""
 
+from numbers import Real
 from typing import Annotated, TypeVar
 
 import numpy as np
@@ -39,9 +40,30 @@ Random = Out[WordArray1]
 
 
 def instance(name: str, value: object, kind: type) -> None:
-    """Raise ``ValueError``, saying what was passed, if it is not of a public class."""
+    """Raise ``ValueError``, saying what was passed, if it is not of this class."""
     if not isinstance(value, kind):
         detail = f" ({value})" if type(value).__name__ == "Failure" else ""
         raise ValueError(
-            f"{name} must be an rs_localizer.{kind.__name__}, got {type(value).__name__}{detail}"
+            f"{name} must be of type {kind.__name__}, got {type(value).__name__}{detail}"
         )
+
+
+def real(
+    name: str, value: object, kind: str, low: float, high: float = np.finfo(float).max
+) -> None:
+    """Raise ``ValueError``, saying what was passed, unless ``low <= value <= high``."""
+    if not (isinstance(value, Real) and low <= float(value) <= high):
+        raise ValueError(f"{name} must be {kind}, got {value!r}")
+
+
+def whole_ns(time_ns: object) -> int:
+    """Return a time as Python's integer, of any type of integer; ``ValueError`` for others.
+
+    Differences of NumPy's unsigned integers would wrap around.
+    """
+    if isinstance(time_ns, bool) or not isinstance(time_ns, (int, np.integer)):
+        raise ValueError(
+            f"time_ns must be a whole number of nanoseconds, got {time_ns!r} "
+            f"({type(time_ns).__name__}): round(1e9 * seconds)"
+        )
+    return int(time_ns)

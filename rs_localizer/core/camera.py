@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core import lens_laws
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, instance, real
 from rs_localizer.core.double_sphere import DOUBLE_SPHERE
 from rs_localizer.core.equidistant import EQUIDISTANT
 from rs_localizer.core.eucm import EUCM
@@ -100,6 +100,10 @@ class Roi:
     y_offset: int
     width: int
     height: int
+
+    def __post_init__(self) -> None:
+        for name in ("x_offset", "y_offset", "width", "height"):
+            object.__setattr__(self, name, pixel_count(f"roi.{name}", getattr(self, name)))
 
 
 # A principal point is no farther from the middle, and beside it, as a share of width and height.
@@ -220,19 +224,20 @@ class Camera:
                 f"the image must be at least 2x2 and at most {_WIDEST} pixels wide and high, got "
                 f"{self.width}x{self.height}"
             )
-        if not isinstance(self.readout_time, Real) or not 0.0 <= self.readout_time < math.inf:
-            raise ValueError(f"readout_time must be 0 or more seconds, got {self.readout_time!r}")
+        real("readout_time", self.readout_time, "0 or more seconds", 0.0)
         object.__setattr__(self, "readout_time", float(self.readout_time))
         if self.readout_time > _LONGEST_READOUT:
             raise ValueError(
                 f"readout_time must be at most {_LONGEST_READOUT:g} s, got {self.readout_time:g}: "
                 f"it is in seconds; {self.readout_time:g} ms are {1e-3 * self.readout_time:g}"
             )
-        if not all(isinstance(step, Integral) and step > 0 for step in self.binning):
+        steps = self.binning if np.ndim(self.binning) == 1 else ()
+        if len(steps) != 2 or not all(isinstance(step, Integral) and step > 0 for step in steps):
             raise ValueError(f"binning must be two numbers of 1 or more, got {self.binning}")
         if not (_LEAST_FOCAL < K[0, 0] < _MOST_FOCAL and _LEAST_FOCAL < K[1, 1] < _MOST_FOCAL):
             raise ValueError(f"focal lengths of {K[0, 0]:g}, {K[1, 1]:g} pixels are impossible")
-        roi = self.roi
+        if (roi := self.roi) is not None:
+            instance("roi", roi, Roi)
         if roi is not None and (
             min(roi.width, roi.height) < 1
             or min(roi.x_offset, roi.y_offset) < 0

@@ -12,7 +12,7 @@ With ``A x`` in the columns of the motion the prior of the rest is one of :class
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -128,6 +128,7 @@ class Foretold(Protocol):
         """Return the estimate that it makes of the last frame's."""
 
 
+@runtime_checkable
 class Aid(Protocol):
     """Who knows from readings how a camera turns, and learns from its frames.
 

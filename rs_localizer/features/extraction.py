@@ -18,10 +18,10 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.io.maps.landmarks import Map
 
 _ORB_BYTES = 32  # of a descriptor; AKAZE's has 61
-# A corner is looked for within this many pixels of FAST's, gradients are summed over as many.
-_REACH = _WINDOW = 1
-# Around a corner: its reach, a neighbour for the parabola, the window, a neighbour for gradients.
-_MARGIN = _REACH + 1 + _WINDOW + 1
+# A corner is looked for within this many pixels of FAST's, gradients are summed over a square of
+# this side. A parabola through its strength needs a neighbour.
+_REACH, _WINDOW = 1, 3
+_MARGIN = _REACH + 1
 
 
 def refine_corners(
@@ -55,41 +55,18 @@ def refine_corners(
 
 def _offsets(image: NDArray[np.uint8], corners: IntArray) -> Array:
     """Return offsets (n,2) from whole pixels (n,2) of an image to the corners beside them."""
-    around = np.arange(-_MARGIN, _MARGIN + 1)
-    padded = np.pad(image, _MARGIN, mode="edge")
-    columns, rows = corners[:, :1] + _MARGIN + around, corners[:, 1:] + _MARGIN + around
-    strength = _strength(padded[rows[:, :, None], columns[:, None, :]].astype(np.float64))
+    # Of gradients the smaller eigenvalue of the second moments, as Shi and Tomasi.
+    strength = np.pad(cv2.cornerMinEigenVal(image, _WINDOW).astype(np.float64), _MARGIN, "edge")
+    around = np.arange(-_MARGIN, _MARGIN + 1) + _MARGIN
+    columns, rows = corners[:, :1] + around, corners[:, 1:] + around
+    near = strength[rows[:, :, None], columns[:, None, :]]
     count, side = len(corners), 2 * _REACH + 1
-    best = strength[:, 1:-1, 1:-1].reshape(count, side * side).argmax(axis=1)
+    best = near[:, 1:-1, 1:-1].reshape(count, side * side).argmax(axis=1)
     y, x = best // side + 1, best % side + 1
-    n, peak = np.arange(count), strength[np.arange(count), y, x]
-    across = _vertex(strength[n, y, x - 1], peak, strength[n, y, x + 1])
-    along = _vertex(strength[n, y - 1, x], peak, strength[n, y + 1, x])
-    return np.column_stack([x + across, y + along]) - (_REACH + 1)
-
-
-def _strength(patches: Array) -> Array:
-    """Return the smaller eigenvalue of the second moments (n,s,s) in patches (n,s+4,s+4)."""
-    dx = _smooth(patches[:, :, 2:] - patches[:, :, :-2], 1)
-    dy = _smooth(patches[:, 2:] - patches[:, :-2], 2)
-    xx, yy, xy = _window(dx * dx), _window(dy * dy), _window(dx * dy)
-    smaller: Array = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
-    return smaller
-
-
-def _smooth(values: Array, axis: int) -> Array:
-    """Smooth by 1, 2, 1 along an axis, for Sobel's gradients."""
-    first = np.moveaxis(values, axis, 0)
-    smooth: Array = np.moveaxis(first[:-2] + 2.0 * first[1:-1] + first[2:], 0, axis)
-    return smooth
-
-
-def _window(values: Array) -> Array:
-    """Return the sums over square windows of values (n,s,s)."""
-    side = 2 * _WINDOW + 1
-    windows = np.lib.stride_tricks.sliding_window_view(values, (side, side), (1, 2))
-    sums: Array = windows.sum(axis=(3, 4))
-    return sums
+    n, peak = np.arange(count), near[np.arange(count), y, x]
+    across = _vertex(near[n, y, x - 1], peak, near[n, y, x + 1])
+    along = _vertex(near[n, y - 1, x], peak, near[n, y + 1, x])
+    return np.column_stack([x + across, y + along]) - _MARGIN
 
 
 def _vertex(before: Array, peak: Array, after: Array) -> Array:

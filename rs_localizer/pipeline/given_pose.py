@@ -2,14 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A pose that others know, as a prior of frames that no frame before predicts.
 
-A user's click in RViz, a filter's pose, the last one in a file: where no track is, the frame is
+A user's click in RViz, a filter's pose: where no track is, the frame is
 looked for near it, within its covariance, before it is searched for everywhere. Points that
 disagree count more. While there is a track it says nothing: a filter's pose has our own in it.
 """
 
-import json
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,7 +19,6 @@ from rs_localizer.core.reasons import Notice
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.prior import Prior
-from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.transforms import Transform, TransformError, from_numbers
 from rs_localizer.pipeline.aid import Moment
@@ -34,11 +31,6 @@ _LEAST = (0.01, 0.005)
 _OLDEST = 10.0  # s
 # Squared distance of six numbers from what was given that one pose in ten thousand has.
 _FAR = 27.9
-
-PERIOD = 10.0
-"""So often a pose is saved, in s."""
-# While nobody looked, a robot may have been moved as far as a click in RViz is uncertain: m, rad.
-_MOVED = np.diag(np.repeat((0.5, 0.26), 3)) ** 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,35 +91,6 @@ def _given(
         raise MessageError(f"the given pose has variances below zero: {variances.tolist()}")
     names = frame.removeprefix("/"), body.removeprefix("/")
     return GivenPose(stamp, *names, pose, 0.5 * (spread + spread.T))
-
-
-def save_pose(file: Path, map_frame: str, map_from_body: Transform, covariance: Array) -> None:
-    """Write a pose; the last one stays if the disk is full (:class:`.OutputError`)."""
-    text = json.dumps({
-        "map_frame": map_frame,
-        "position": map_from_body.translation.tolist(),
-        "quaternion": so3.quaternion(np.ascontiguousarray(map_from_body.rotation)).tolist(),
-        "covariance": covariance.tolist(),
-    }, indent=1)  # fmt: skip
-    with atomic_files(file) as (part,):
-        part.write_text(text, encoding="utf-8")
-
-
-def load_pose(file: Path) -> GivenPose | None:
-    """Load the pose of a file, as a click now; None if there is no file yet.
-
-    Raises:
-        ValueError: for a file that holds something else, saying what.
-    """
-    try:
-        said = json.loads(file.read_text(encoding="utf-8"))
-        values = (said[name] for name in ("position", "quaternion", "covariance"))
-        given = _given(0, str(said["map_frame"]), "", *values)
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"saved_pose_file {file} holds no pose: {error!r}") from error
-    return replace(given, covariance=given.covariance + _MOVED)
 
 
 class PosePrior:

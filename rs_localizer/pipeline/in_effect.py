@@ -11,7 +11,7 @@ from rs_localizer.config import Imu, ImuUse, NodeConfig, PublishTf, RefinementKi
 _BESIDE = frozenset({
     "readout_time_deviation", "pose_time", "max_points", "base_frame",
     "odom_frame", "publish_tf", "tf_rate", "hold", "two_d_mode",
-    "transform_tolerance", "saved_pose_file", "map_file", "map_frame", "marker_map",
+    "transform_tolerance", "map_file", "map_frame", "marker_map",
     "autostart", "output_rate", "camera_file",
 })  # fmt: skip
 

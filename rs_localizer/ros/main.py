@@ -15,7 +15,7 @@ from rs_localizer.process.missing import explain
 from rs_localizer.process.stopping import StopRequest
 
 _HELP, _VERSION = ("-h", "--help"), ("--version",)
-_ROS_ARGUMENTS = "--ros-args"  # what follows is for ROS
+_ROS_ARGUMENTS, _END_OF_THEM = "--ros-args", "--"  # what is between them is for ROS
 
 # For each executable, the class of its node or its function below rs_localizer.ros, the name of a
 # node with settings, and a description.
@@ -43,19 +43,35 @@ _PROGRAMS = {
 }
 
 
+class CommandLineError(Exception):
+    """Some argument is neither for ROS nor known."""
+
+
 def answer(name: str, words: Sequence[str]) -> str | None:
     """Return the text that is asked for; None if a program is to start.
 
     Args:
         name: of the executable.
         words: arguments of the command line.
+
+    Raises:
+        CommandLineError: an argument is neither for ROS nor known.
     """
-    own = list(words)
-    if _ROS_ARGUMENTS in own:
-        own = own[: own.index(_ROS_ARGUMENTS)]
+    own, for_ros = [], False
+    for word in words:
+        for_ros = word == _ROS_ARGUMENTS or (for_ros and word != _END_OF_THEM)
+        if not for_ros and word != _END_OF_THEM:
+            own.append(word)
     if any(word in _VERSION for word in own):
         return f"rs_localizer {rs_localizer.__version__}\n"
-    return _help(name) if any(word in _HELP for word in own) else None
+    if any(word in _HELP for word in own):
+        return _help(name)
+    if own:
+        raise CommandLineError(
+            f"unknown arguments: {' '.join(own)}. Parameters and remappings follow "
+            f"{_ROS_ARGUMENTS}: see ros2 run rs_localizer {name} --help"
+        )
+    return None
 
 
 def _help(name: str) -> str:
@@ -101,6 +117,9 @@ def _run(name: str, args: list[str] | None = None) -> int:
         except ImportError as error:
             sys.stderr.write(f"{name}: {explain(error)}\n")
             return 1
+        except CommandLineError as error:
+            sys.stderr.write(f"{name}: {error}\n")
+            return 2
         code: int = make(stop, args)
         return code
 

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, real
 from rs_localizer.solvers.batch import MODEL_SIZE, unpack
 from rs_localizer.solvers.table import SOLVERS, find_solver
 
@@ -66,10 +66,8 @@ def solve_minimal(
     initial = np.eye(3) if rotation is None else np.ascontiguousarray(rotation, dtype=np.float64)
     if initial.shape not in ((3, 3), (h, 3, 3)):
         raise ValueError(f"rotation must be (3,3) or ({h},3,3), got {initial.shape}")
-    if iterations < 1:
-        raise ValueError(f"iterations must be 1 or more, got {iterations}")
-    if threads < 0:
-        raise ValueError(f"threads must be 0 (all cores) or more, got {threads}")
+    real("iterations", iterations, "1 or more", 1)
+    real("threads", threads, "0 (all cores) or more", 0)
     if bound is not None and not (row.bounded and bound > 0.0):
         raise ValueError(f"bound is that of r6p, above 0, got {bound} for {name}")
     samples = np.arange(h * n, dtype=np.int64).reshape(h, n)

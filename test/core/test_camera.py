@@ -161,6 +161,9 @@ def test_inside_is_the_area_of_the_pixels():
         ({"readout_time": 30}, r"at most 0\.5 s, got 30: it is in seconds; 30 ms are 0.03"),
         ({"readout_time": 0.9}, r"at most 0\.5 s, got 0\.9"),
         ({"K": None}, "K must be numbers, got None"),
+        ({"binning": 2}, "binning must be two numbers of 1 or more, got 2"),
+        ({"binning": (2,)}, "binning must be two numbers"),
+        ({"roi": (0, 0, 5, 5)}, "roi must be of type Roi, got tuple"),
         ({"roi": Roi(0, 0, 700, 480)}, "does not lie on a sensor of 640x480"),
     ],
 )

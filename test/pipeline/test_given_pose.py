@@ -1,8 +1,7 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A pose from outside or from a file: what it says of the camera, and when it is not used."""
+"""A pose from outside: what it says of the camera, and when it is not used."""
 
-import json
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,7 +14,7 @@ from rs_localizer.io.bags import make_message
 from rs_localizer.io.messages import MessageError, make_header, make_quaternion, make_vector
 from rs_localizer.io.transforms import Transform, TransformTree, make_transform
 from rs_localizer.pipeline.aid import Moment
-from rs_localizer.pipeline.given_pose import PosePrior, load_pose, read_given_pose, save_pose
+from rs_localizer.pipeline.given_pose import PosePrior, read_given_pose
 
 SECOND = 10**9
 CONFIG = NodeConfig(readout_time=0.03, base_frame="base_link")
@@ -121,44 +120,3 @@ def test_a_click_counts_once_and_a_filter_again_and_again(body, lasts):
 def test_covariances_that_are_none_are_named(variance, fault):
     with pytest.raises(MessageError, match=fault):
         read_given_pose(given(variances=(0.25, variance, 0, 0, 0, 0.0685)))
-
-
-POSE = Transform(Rotation.from_euler("zyx", [0.7, 0.1, -0.2]).as_matrix(), np.array([3.0, 4, 0.2]))
-
-
-def test_what_is_saved_is_started_from_and_less_certain(tmp_path):
-    file = tmp_path / "pose.json"
-    assert load_pose(file) is None
-    save_pose(file, "map", POSE, 1e-4 * np.eye(6))
-    given = load_pose(file)
-    assert (given.stamp_ns, given.frame, given.body) == (0, "map", "")
-    assert np.array_equal(given.pose.translation, POSE.translation)
-    assert np.allclose(given.pose.rotation, POSE.rotation, atol=1e-15)
-    assert np.sqrt(given.covariance.diagonal()) == pytest.approx(np.repeat([0.5, 0.26], 3), 1e-3)
-
-
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
-        ({"position": [1.0, 2.0]}, "not enough values"),
-        ({"position": [1.0, 2.0, float("nan")]}, "not finite"),
-        ({"quaternion": [1.0, 1.0, 1.0, 1.0]}, "not a rotation"),
-        ({"covariance": (-np.eye(6)).tolist()}, "variances below zero"),
-        ({"position": "here"}, "holds no pose"),
-        (None, "holds no pose"),
-    ],
-)
-def test_a_file_that_holds_no_pose_is_named(tmp_path, change, text):
-    file = tmp_path / "pose.json"
-    save_pose(file, "map", POSE, np.eye(6))
-    whole = {} if change is None else json.loads(file.read_text()) | change
-    file.write_text(json.dumps(whole))
-    with pytest.raises(ValueError, match=text) as error:
-        load_pose(file)
-    assert str(file) in str(error.value)
-
-
-def test_a_file_that_no_timer_would_save_or_start_from_is_refused():
-    NodeConfig(saved_pose_file="pose.json")
-    with pytest.raises(ValueError, match="saved_pose_file needs a tf_rate above 0"):
-        NodeConfig(saved_pose_file="pose.json", tf_rate=0.0)

@@ -26,6 +26,7 @@ from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.prints import Chessboard
 from rs_localizer.pipeline.inputs import INPUTS
+from rs_localizer.ros import main
 from rs_localizer.ros.localizer.node import LocalizerNode
 from rs_localizer.settings import (
     DETECTOR_NAME,
@@ -285,3 +286,15 @@ def test_robot_localization_listens_to_what_the_node_publishes():
     for name in ("odom0", *kinds):
         assert [type(item) for item in found[f"{name}_config"]] == [bool] * 15
     assert found["world_frame"] == found["map_frame"]
+
+
+def test_only_what_is_for_ros_is_handed_on():
+    for words in ("", "--ros-args -r imu:=/imu --log-level debug", "--ros-args -p a:=1 --"):
+        assert main.answer("localizer", words.split()) is None
+    assert "usage" in str(main.answer("localizer", ["--ros-args", "-p", "a:=1", "--", "--help"]))
+    for words in ("--badarg", "imu:=/imu", "--ros-args -p a:=1 -- --badarg"):
+        with pytest.raises(
+            main.CommandLineError, match=f"unknown arguments: {words.split()[-1]}. Param"
+        ):
+            main.answer("localizer", words.split())
+    assert main.main(["--badarg"]) == 2

@@ -2,13 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """TF's side of the outputs: sends transforms, and hears who else does."""
 
-import contextlib
 import math
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,13 +14,12 @@ from rclpy.node import Node
 
 from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.core.reasons import Notice
-from rs_localizer.io.atomic_files import OutputError
 from rs_localizer.io.messages import make_header
 from rs_localizer.io.outputs import BodyPose, Localized, make_pose_with_covariance
 from rs_localizer.io.topics import LIVE, MAP_TO_ODOM
 from rs_localizer.io.transforms import NotYetError, Transform, TransformError, make_transform
 from rs_localizer.pipeline.carried_pose import Click, FoundPose, Odometry
-from rs_localizer.pipeline.given_pose import PERIOD, GivenPose, load_pose, save_pose
+from rs_localizer.pipeline.given_pose import GivenPose
 from rs_localizer.pipeline.map_to_odom import CorrectionState, Decision, Settings, Standing, decide
 from rs_localizer.pipeline.published import Broadcast, pose_in_odometry, pose_transform
 from rs_localizer.ros.localizer.rivals import Rivals
@@ -69,15 +66,14 @@ class Broadcaster:
         self._sent_ns = 0  # the newest stamp of map -> odom
         self._body = ""  # frame of the body whose correction is held
         self._answer = ""  # to the last given pose
-        self._saved: GivenPose | None = None  # of a file; taken when odometry has come
-        self._save_at = self._sent = 0.0  # time.monotonic()
+        self._sent = 0.0  # time.monotonic()
         self._failed = -math.inf, ""  # when, likewise, and why
 
     def configure(self, config: NodeConfig) -> None:
         """Create what these settings need.
 
         Raises:
-            ValueError: without tf2_ros; for a file that holds no pose.
+            ValueError: without tf2_ros.
         """
         self.tf.configure(config)
         if config.publish_tf != PublishTf.NONE and self._broadcaster is None:
@@ -89,8 +85,6 @@ class Broadcaster:
         if self._publisher is None:
             kind = message_class(LIVE[MAP_TO_ODOM])
             self._publisher = self._node.create_publisher(kind, f"~/{MAP_TO_ODOM}", 10)
-            if config.saved_pose_file:
-                self._saved = load_pose(Path(config.saved_pose_file))
         if config.tf_rate > 0.0:
             self._timer = steady_timer(self._node, 1.0 / config.tf_rate, self._tick)
 
@@ -106,7 +100,6 @@ class Broadcaster:
     def forget(self) -> None:
         """Send nothing of the frames so far."""
         with self._sending:
-            self._save()
             self._pending.clear()
             self._forget_pose()
             self._failed, self._answer = (-math.inf, ""), ""
@@ -270,30 +263,10 @@ class Broadcaster:
 
     def _tick(self) -> None:
         with self._sending:
-            if self._saved is not None and self._state.held is None and self._body:
-                with contextlib.suppress(TransformError):  # odometry has not come yet
-                    self._click(self._saved, True)
-                    self._saved = None
             try:
                 self._hold()
             except TransformError as error:
                 self._say(error)
-            if time.monotonic() >= self._save_at:
-                self._save()
-
-    def _save(self) -> None:
-        """Keep the pose in the file that the settings name."""
-        self._save_at = time.monotonic() + PERIOD
-        file, decision, newest = self._config.saved_pose_file, self.decision, self._state.newest
-        if not file or decision is None or newest is None or decision.map_from_odom is None:
-            return
-        if decision.standing is Standing.CONTRADICTED or decision.covariance is None:
-            return
-        where = decision.map_from_odom @ newest.odom_from_body
-        try:
-            save_pose(Path(file), self._map_frame, where, decision.covariance)
-        except OutputError as error:
-            self._refusals.notice(Notice.NOT_BROADCAST, f"saved_pose_file: {error}")
 
     def _hold(self) -> None:
         """Send the held transform, stamped ahead of the newest odometry, if that is new."""

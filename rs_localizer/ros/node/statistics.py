@@ -20,6 +20,8 @@ _FEWEST = 8  # intervals of which something can be said
 # Intervals count as multiples of the shortest when they are off by less than this part of it.
 _LOOSE = 0.2
 _MOST_LOOSE = 0.1  # share of intervals that may be further off
+WINDOW = 5.0
+"""What "now" means, in s."""
 
 
 def missing(stamps_ns: Sequence[int]) -> int:
@@ -29,7 +31,8 @@ def missing(stamps_ns: Sequence[int]) -> int:
         stamps_ns: in the order of arrival.
     """
     intervals = np.diff(np.array(stamps_ns, np.int64)).astype(np.float64)
-    intervals = intervals[intervals > 0.0]  # a recording may start over
+    # A recording may start over, or a clock be set: no frame of now was awaited for so long.
+    intervals = intervals[(intervals > 0.0) & (intervals < 1e9 * WINDOW)]
     if len(intervals) < _FEWEST:
         return 0
     # A few may be shorter than the period: a late stamp, a frame that is sent twice.
@@ -47,9 +50,6 @@ def missing(stamps_ns: Sequence[int]) -> int:
 
 
 Result = TypeVar("Result")
-
-WINDOW = 5.0
-"""What "now" means, in s."""
 
 # Events that are remembered; a window of faster cameras is shorter.
 _MOST_EVENTS = 8192

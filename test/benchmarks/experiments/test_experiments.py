@@ -11,12 +11,10 @@ from collections.abc import Iterable, Iterator
 import pytest
 
 from benchmarks.__main__ import EXPERIMENTS
-from benchmarks.experiments import convergence, readout_time
-from benchmarks.experiments.results import Context, Result
+from benchmarks.experiments import convergence
+from benchmarks.experiments.results import Context
 
 TRIALS = 300
-# Of many recordings; what they measure is held by tests of their own.
-FEW = {"readout-time": 40}
 
 
 def _names(claims: dict[str, str]) -> set[str]:
@@ -39,7 +37,6 @@ HELD = _names(
         ),
         "from-p3p": "vcwt_once_matches_r6p vcwt_beats_p3p r6p_vcwt_equals_r6p",
         "sequences": "vcwt_equals_r6p beat_p3p",
-        "readout-time": "direction global",
     }
 )
 NOT_HELD = _names(
@@ -51,14 +48,6 @@ def untracked(items: Iterable, total: int) -> Iterator:
     return iter(items)
 
 
-def result(name: str) -> Result:
-    context = Context(FEW.get(name, TRIALS), 0, untracked)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(readout_time, "_LEAST", 4)
-        patch.setattr(readout_time, "_GLOBAL", 4)  # one of them
-        return EXPERIMENTS[name](context)
-
-
 def test_right_solvers_are_exact():
     assert all(claim.held for claim in convergence.exactness(Context(40, 0, untracked)))
 
@@ -66,7 +55,7 @@ def test_right_solvers_are_exact():
 @pytest.mark.bench
 @pytest.mark.parametrize("name", list(EXPERIMENTS))
 def test_verdicts(name):
-    found = result(name)
+    found = EXPERIMENTS[name](Context(TRIALS, 0, untracked))
     claims = {claim.name: claim for claim in found.claims}
     assert {claim.split(".")[0] for claim in claims} == {name}
     assert set(claims) >= {one for one in HELD | NOT_HELD if one.split(".")[0] == name}

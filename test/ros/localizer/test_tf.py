@@ -3,7 +3,6 @@
 """TF in the node. Where tf2_ros is installed the same tests run with it."""
 
 import contextlib
-import json
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -242,28 +241,6 @@ def test_what_begins_no_transform_is_answered(made, robot, peer):
     node.broadcaster.give(click(0.0, 5.0))
     assert node.notes == [("pose_given", "refused: set base_frame, of which it is the pose")]
     made(publish_tf="map_to_camera").broadcaster.give(click(0.0, 5.0))
-
-
-def test_the_last_pose_is_kept_and_started_from(made, robot, peer, tmp_path):
-    file = tmp_path / "pose.json"
-    settings = {
-        "publish_tf": "map_to_odom", "base_frame": "base_link", "saved_pose_file": str(file),
-    }  # fmt: skip
-    node = made(**settings)
-    odometry(node, robot, peer, *range(50, 61))
-    node.publish(frame(5_500_000_000, x=12.0))
-    node.broadcaster.close()
-    saved = json.loads(file.read_text())
-    assert saved["position"] == pytest.approx([12.5, 0.0, 0.0])
-    again = made(**settings)
-    odometry(again, robot, peer, 60)
-    assert peer.spin_until(lambda: again.broadcaster.decision is not None)
-    assert again.notes[-1] == ("pose_given", "taken: map -> odom begins with it")
-    body = again.broadcaster.decision.map_from_odom @ Transform(np.eye(3), np.array([6.0, 0, 0]))
-    assert body.translation[0] == pytest.approx(12.5)
-    file.write_text("{}")
-    with pytest.raises(ValueError, match=r"saved_pose_file .*pose.json holds no pose"):
-        made(**settings)
 
 
 @pytest.fixture

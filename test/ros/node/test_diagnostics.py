@@ -96,6 +96,12 @@ def test_what_was_dropped_is_counted(rate, jitter, share, seeds):
         assert missing(sent[keep].astype(np.int64)) == count - keep.sum()
 
 
+def test_a_clock_that_is_set_loses_nothing():
+    sent = np.arange(30) * 33_333_333
+    sent[15:] += 3_600_000_000_000
+    assert missing(sent) == 0
+
+
 def test_a_reason_is_logged_once_in_five_seconds_and_always_counted():
     lines, now = [], [100.0]
     refusals = Refusals(lines.append, clock=lambda: now[0])
