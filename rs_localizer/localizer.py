@@ -20,7 +20,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Rig, RigEstimate
 from rs_localizer.core.rotation_prior import RotationPrior
-from rs_localizer.core.state import POSE, rotation_of
+from rs_localizer.core.state import POSE, VELOCITIES, rotation_of, step_between
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.acceptance import (
     estimate_of,
@@ -50,6 +50,7 @@ from rs_localizer.estimation.points import (
     packed,
 )
 from rs_localizer.estimation.prior import (
+    Assumed,
     Prior,
     PriorTerms,
     assumptions,
@@ -79,6 +80,8 @@ _LOOKS = 2
 _STILL_TRACKED = 0.7
 # If noise fills a gate, it is widened up to this many times, by at least this factor at a time.
 _WIDEST, _LEAST_WIDER = 4.0, 1.25
+# Errors of a rough map, in focal lengths, beyond which poses are known to some ten degrees only.
+_ROUGHEST = 0.04
 # Noise is half-normal, of this part of the gate: users leave room for errors of 3.5 deviations.
 _NOISE = 0.25
 
@@ -393,26 +396,58 @@ class Localizer:
         while True:
             posterior = frame_posterior(observations, best.state, terms, gate, assumed)
             posterior = posterior._replace(gate=gate)
-            if gate >= most:
-                return posterior
-            # A map whose points are off by more than anybody said has more noise than a gate lets
-            # through: as long as the noise fills it, nobody knows how much.
-            if noise_fills(posterior, rolling):
+            # As long as the noise fills the gate, nobody knows how much it is.
+            if gate < most and noise_fills(posterior, gate, rolling):
                 gate = min(max(GATE / WIDEST_GATE * posterior.noise, _LEAST_WIDER * gate), most)
-            elif searched and by_chance(observed, posterior, threshold) is not None:
+            elif gate < most and searched and by_chance(observed, posterior, threshold) is not None:
                 gate = most  # some of few points that vibrate fit a motion without vibration
+            elif rolling and noise_fills(posterior, threshold, rolling):
+                return self._of_rough_map(observed, posterior, terms, assumed)
             else:
                 return posterior
+
+    def _of_rough_map(
+        self, observed: Observed, posterior: Posterior, terms: PriorTerms, assumed: Assumed
+    ) -> Posterior:
+        """Return the posterior before a map that is off by more than anybody said.
+
+        How far its points are off is learnt from the frame, and is then what ``map_deviation`` is.
+        """
+        noise, vibrating = 0.0, posterior
+        most = max(_ROUGHEST * assumed.focal_length, posterior.noise)
+        while posterior.noise > _LEAST_WIDER * noise and noise < most:
+            noise = min(posterior.noise, most)
+            gate = _MAP_GATE * noise
+            # Near a motion of few of them that happen to fit, others are found from far.
+            state = self._search.optimize(
+                observed, posterior.state, 2.0 * _MAP_GATE * most, terms, gate
+            ).state
+            deviation = noise * self._depth(observed, state) / assumed.focal_length
+            assumed = replace(assumed, map_deviation=deviation, noise=_NOISE * gate)
+            posterior = frame_posterior(observed.observations, state, terms, gate, assumed)
+        if not len(vibrating.shake):
+            return posterior._replace(gate=gate)
+        # Few points that vibrate look alike: regions of the velocities hold both.
+        undetected = posterior.undetected.copy()
+        step = step_between(posterior.state, vibrating.state)[VELOCITIES]
+        undetected[VELOCITIES, VELOCITIES] += (
+            np.outer(step, step) + vibrating.covariance[VELOCITIES, VELOCITIES]
+        )
+        return posterior._replace(gate=gate, undetected=undetected)
 
     def _gate(self, observed: Observed, state: Array) -> float:
         """Return the inlier threshold (px), widened by the declared deviation of the map."""
         threshold, deviation = self.config.inlier_threshold, self.config.map_deviation
         if not deviation > 0.0:
             return threshold
+        depth = self._depth(observed, state)
+        return math.hypot(threshold, _MAP_GATE * deviation * observed.assumed.focal_length / depth)
+
+    def _depth(self, observed: Observed, state: Array) -> float:
+        """Return the median depth (m) of all points."""
         observations = observed.observations
-        depth = observations.median_depth(state, np.ones(len(observations), dtype=np.bool_))
-        focal = observed.assumed.focal_length
-        return math.hypot(threshold, _MAP_GATE * deviation * focal / max(depth, NEAREST))
+        every = np.ones(len(observations), dtype=np.bool_)
+        return max(observations.median_depth(state, every), NEAREST)
 
     def _own_terms(self, observed: Observed, prior: Prior) -> PriorTerms:
         """Return the prior of a frame from itself and from the velocities of earlier frames.

@@ -101,7 +101,7 @@ def refusal(
             Reason.DEGENERATE,
             f"{found} inliers leave the motion so open that it cannot be computed",
         )
-    if noise_fills(posterior, rolling):
+    if noise_fills(posterior, posterior.gate, rolling):
         return Failure(
             Reason.RESIDUAL,
             f"{found} inliers with errors of {posterior.noise:.2g} px (one sigma) around an "
@@ -123,10 +123,10 @@ def _too_few(inliers: BoolArray, squared_errors: Array, samples: int, needed: in
     )
 
 
-def noise_fills(posterior: Posterior, rolling: bool) -> bool:
-    """Return whether errors are as large as the gate allows, so that the noise is unknown."""
+def noise_fills(posterior: Posterior, gate: float, rolling: bool) -> bool:
+    """Return whether errors are as large as a gate (px) allows, so that the noise is unknown."""
     most = _MOST_NOISE if rolling else _MOST_NOISE_GLOBAL_SHUTTER
-    return posterior.noise > most * posterior.gate
+    return posterior.noise > most * gate
 
 
 def speeding(observed: Observed, state: Array) -> float:

@@ -136,7 +136,7 @@ def left_out(
     # A principal point alone may point to another image.
     most = _BENT_OFF_CENTRE if off_centre(observed.exposure.cameras[0]) else _BENT
     bent = posterior.model_error > most * promised(posterior)
-    bent |= posterior.noise > EXPECTED_NOISE * threshold
+    bent |= wide or posterior.noise > EXPECTED_NOISE * threshold
     second = _own_motion(search, observed, rest, threshold) if left > _SAMPLE else None
     # Before K errors hang together: some of them over the image, or those of a second group.
     alone = observed.exposure.alone

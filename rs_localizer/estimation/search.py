@@ -428,11 +428,12 @@ class MotionSearch:
         return other if other.cost < found.cost else found
 
     def optimize(
-        self, observed: Observed, state: Array, first_scale: float, terms: PriorTerms
+        self, observed: Observed, state: Array, first_scale: float, terms: PriorTerms,
+        last_scale: float | None = None,
     ) -> Candidate:
         """Optimize one state locally, down to the inlier threshold."""
         optimized, cost = optimize(
             state[None], np.zeros(1), observed.observations.packed, first_scale,
-            self._config.inlier_threshold, terms, self._noise,
+            last_scale or self._config.inlier_threshold, terms, self._noise,
         )  # fmt: skip
         return Candidate(optimized, cost)
