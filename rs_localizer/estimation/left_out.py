@@ -19,7 +19,14 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.lens import centre_of, off_centre
 from rs_localizer.core.reasons import Reason
-from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, TURN, step_between
+from rs_localizer.core.state import (
+    MOTION_PARAMETERS,
+    MOVE,
+    PARAMETERS,
+    POSE,
+    TURN,
+    step_between,
+)
 from rs_localizer.core.types import Failure
 from rs_localizer.estimation.acceptance import speeding
 from rs_localizer.estimation.calibration import promised
@@ -195,13 +202,7 @@ def _cameras_apart(observed: Observed, inliers: BoolArray, second: _Group, thres
 def _reordered(search: MotionSearch, observed: Observed, gate: float) -> Failure | None:
     """Return the failure of a frame of markers that fit if their corners come in another order."""
     seen, usable = observed.observations, observed.usable.indices
-    if len(usable) % 4 or len(usable) < len(observed.points):
-        return None
-    corners = observed.points.reshape(-1, 4, 3)
-    skew = np.linalg.norm(np.einsum("mki,k->mi", corners, _ROUND), axis=1)
-    if np.any(skew > _FLAT * np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)):
-        return None
-    for order in ORDERS:
+    for order in ORDERS if _markers(observed) else ():
         by = np.arange(len(usable)).reshape(-1, 4)[:, order].ravel()
         part = replace(observed, ranking=observed.ranking[:0], observations=Observations.of(
             seen.points, seen.rays[by], seen.tau[by], seen.by_ray[by], seen.mounts, seen.camera[by]
@@ -210,6 +211,17 @@ def _reordered(search: MotionSearch, observed: Observed, gate: float) -> Failure
         if fit.found and np.mean(part.observations.within(fit.state, gate)) > _FIT:
             return Failure(Reason.CALIBRATION, f"the points fit if {in_order(order)}")
     return None
+
+
+def _markers(observed: Observed) -> int:
+    """Return how many markers a frame shows, if nothing else: of each the corners, in a row."""
+    usable = observed.usable.indices
+    if len(usable) % 4 or len(usable) < len(observed.points):
+        return 0
+    corners = observed.points.reshape(-1, 4, 3)
+    skew = np.linalg.norm(np.einsum("mki,k->mi", corners, _ROUND), axis=1)
+    flat = skew < _FLAT * np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
+    return len(corners) if flat.all() else 0
 
 
 def in_order(order: tuple[int, ...]) -> str:
@@ -292,7 +304,10 @@ def _of_another_lens(
         return None
     first = _Group(posterior.inliers, posterior.state, posterior.squared_errors)
     parts = [(first,)] if second is None else [(first,), (first, second)]
-    evidence = max(_evidence(groups, PARAMETERS * len(groups), count, area) for groups in parts)
+    evidence = max(
+        _evidence_without_a_marker(observed, posterior, threshold),
+        *(_evidence(groups, PARAMETERS * len(groups), count, area) for groups in parts),
+    )
     if explained < evidence + max(0.0 if resized else _EACH * count, _LEAST_CHANCE):
         return None
     fitting = np.count_nonzero(first.chosen)
@@ -317,6 +332,20 @@ def _evidence(groups: tuple[_Group, ...], parameters: int, count: int, area: flo
     )
     density = inside * (math.log(2.0 * math.pi * variance) + 1.0)
     return -density - (count - inside) * math.log(area) - 0.5 * parameters * math.log(2 * inside)
+
+
+def _evidence_without_a_marker(observed: Observed, posterior: Posterior, threshold: float) -> float:
+    """Return the log evidence of a motion and one marker that has a pose of its own."""
+    observations, area = observed.observations, _area(observed)
+    evidences, markers = [-math.inf], _markers(observed)
+    for marker in range(markers):
+        others = np.arange(observations.count) // 4 != marker
+        part = observations.only(np.flatnonzero(others))
+        best = best_motion(part.packed, part.count, posterior.state, observed.terms, threshold)
+        if best.inliers.any():
+            group = _Group(best.inliers, best.state, best.squared_errors)
+            evidences.append(_evidence((group,), PARAMETERS + POSE.stop, part.count, area))
+    return max(evidences) - math.log(max(markers, 1))
 
 
 def _another_lens(
