@@ -316,8 +316,9 @@ class ShutterWatch:
         state = state_in(steady, usable.centre)
         lines = linearized(seen.packed, len(seen), state, np.zeros((len(seen), 6)))
         near = np.linalg.norm(lines.errors, axis=1) < self._gate  # NaN is not
-        ahead = points[own][near] @ found.rotation[2] + found.translation[2]
-        units = np.repeat([1.0, float(np.median(ahead)) if near.any() else 1.0], 3)
+        away = np.linalg.norm(points[own][near] - found.position, axis=1)
+        # Of distances of two sizes a median is now one, now the other: what wanders would jump.
+        units = np.repeat([1.0, 1.0 / float(np.mean(1.0 / away)) if near.any() else 1.0], 3)
         by_pose = lines.by_motion[near, :, POSE] * units
         over_rows = lines.by_motion[near, :, VELOCITIES] * units
         over_columns = self._sideways.row_time(pixels[own][near])[:, None, None] * by_pose

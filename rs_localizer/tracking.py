@@ -339,7 +339,7 @@ class Tracker:
         return there if self._accepted(there) else None
 
     def snapshot(self) -> Tracker:
-        """Return a copy for :meth:`at` in another thread, while frames are localized here."""
+        """Return a copy, made between two frames, for :meth:`at` in another thread."""
         there = copy(self)
         there._seen = deque(map(copy, self._seen), LENGTH)
         there._track = copy(self._track)

@@ -196,10 +196,10 @@ def _of_all(
     observed: Observed, inliers: BoolArray, squared_errors: Array
 ) -> tuple[BoolArray, Array]:
     """Return inliers and residuals of all points that were given, by those of the usable ones."""
-    indices, count = observed.usable.indices, len(observed.points)
+    usable, count = observed.usable, len(observed.points)
     residuals, every = np.full(count, np.nan), np.zeros(count, dtype=np.bool_)
-    residuals[indices], every[indices] = np.sqrt(squared_errors), inliers
-    return every, residuals
+    residuals[usable.indices], every[usable.indices] = np.sqrt(squared_errors), inliers
+    return every[usable.originals], residuals[usable.originals]
 
 
 def estimate_of(

@@ -248,12 +248,16 @@ def rays_of_lens(rotation: RotationPrior | None, tau: Array, rays: Array) -> Arr
 
 # Points farther away than this (m) are faults, and their squares would be infinite.
 _FARTHEST_POINT = 1e9
+# A landmark that is matched again within this (px) says nothing new: detectors find a corner on
+# several scales. Two inliers of a motion are nearer (twice the default threshold).
+_COPY = 4.0
 
 
 class Usable(NamedTuple):
     """Points that can be used."""
 
-    indices: IntArray  # of those that are finite, distinct and inside the image
+    indices: IntArray  # of those that are finite, no copies and inside the image
+    originals: IntArray  # (n,) of which point each is a copy; of itself, if it is none
     shown: BoolArray  # (n,) which lie in the image
     centre: Array  # (3,) map frame: the median of the points
     rays: Array  # (n,2), compensated
@@ -306,13 +310,8 @@ def find_usable(
         parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts, strict=True))
     )
     sizes = np.array([each.camera.size for each in exposure.sides], float)
-    # Equal pixels have equal keys.
-    keys = pixels[:, 0] + math.pi * pixels[:, 1]
-    indices, shown, centre, extent, repeated = _select(points, pixels, rays, side, sizes, keys)
-    if repeated:  # a copy says nothing new
-        pairs = np.hstack([points[indices], pixels[indices], side[indices, None]])
-        indices = indices[np.sort(np.unique(pairs, axis=0, return_index=True)[1])]
-    return Usable(indices, shown, centre, rays, by_ray, tau, side, extent)
+    indices, originals, shown, centre, extent = _select(points, pixels, rays, side, sizes)
+    return Usable(indices, originals, shown, centre, rays, by_ray, tau, side, extent)
 
 
 def _rays(
@@ -328,18 +327,17 @@ def _rays(
 
 @entry
 def _select(
-    points: Array2, pixels: Array2, rays: Array2, side: IntArray1, sizes: Array2, keys: Array1
-) -> tuple[IntArray, BoolArray, Array, float, bool]:
+    points: Array2, pixels: Array2, rays: Array2, side: IntArray1, sizes: Array2
+) -> tuple[IntArray, IntArray, BoolArray, Array, float]:
     """Return places of usable points, without copies.
 
     Args:
         side: (n,) by which each is seen, of a camera with an image of a size (k,2).
-        keys: (n,) of the pixels.
 
     Returns:
-        the usable ones (m,); which (n,) lie in the image, or as far outside as noise may have put
-        them; the median (3,) of the points with a bearing; width or height of what the pixels of a
-        side fill, whichever is the largest; and whether two keys are the same.
+        the usable ones (m,); of which each is a copy (n,); which (n,) lie in the image, or as far
+        outside as noise may have put them; the median (3,) of the points with a bearing; and width
+        or height of what the pixels of a side fill, whichever is the largest.
     """
     count = len(points)
     seen, shown = np.empty(count, dtype=np.bool_), np.empty(count, dtype=np.bool_)
@@ -365,11 +363,20 @@ def _select(
                 low[side[i], axis] = min(least, pixels[i, axis])
                 high[side[i], axis] = max(most, pixels[i, axis])
     extent = max(np.max(high - low), 0.0)
-    usable = np.flatnonzero(seen)
-    sorted_keys, repeated = np.sort(keys[usable]), False
-    for k in range(1, len(usable)):
-        repeated = repeated or sorted_keys[k] == sorted_keys[k - 1]
-    return usable, shown, centre, extent, repeated
+    # The same landmarks have the same keys.
+    keys = points[:, 0] + math.sqrt(2.0) * points[:, 1] + math.sqrt(3.0) * points[:, 2]
+    keys[~seen] = np.inf
+    order, originals = keys.argsort(kind="mergesort"), np.arange(count)
+    for k in range(count):
+        one, later = order[k], k + 1
+        while seen[one] and later < count and keys[order[later]] == keys[one]:
+            other, square = order[later], 0.0
+            for axis in range(2):
+                square += (pixels[other, axis] - pixels[one, axis]) ** 2
+            if square < _COPY**2 and side[other] == side[one]:
+                seen[other], originals[other] = False, one
+            later += 1
+    return np.flatnonzero(seen), originals, shown, centre, extent
 
 
 def packed(exposure: Exposure, points: Array, usable: Usable) -> Observations:
