@@ -93,11 +93,7 @@ setup(
     install_requires=requirements,
     extras_require={
         # ROS 2 Jazzy without an installation of ROS.
-        "ros": [
-            "ros-jazzy-rclpy",
-            "ros-jazzy-common-interfaces",
-            "ros-jazzy-rmw-fastrtps-cpp",
-        ],
+        "ros": ["ros-jazzy-rclpy", "ros-jazzy-common-interfaces", "ros-jazzy-rmw-fastrtps-cpp"],
         "colcon": ["colcon-common-extensions", "ros-jazzy-ament-package"],
         "docs": ["sphinx", "myst-parser", "sphinxcontrib-mermaid"],
         # Of telemetry-parser there is no wheel for 3.13, and a build needs Rust.
@@ -142,6 +138,6 @@ setup(
             "feature_detector = rs_localizer.ros.main:feature_detector",
             "doctor = rs_localizer.ros.main:doctor",
             "rs_localizer = rs_localizer.__main__:run",
-        ],
+        ]
     },
 )

@@ -399,8 +399,7 @@ class NodeConfig(LocalizerConfig):
         (0.0, LONGEST_READOUT_TIME),
     )
     scan_direction: str = setting(
-        ScanDirection.TOP_TO_BOTTOM,
-        "Direction in which the shutter moves over the raw image",
+        ScanDirection.TOP_TO_BOTTOM, "Direction in which the shutter moves over the raw image"
     )
     stamp_offset: float = setting(
         0.0,

@@ -248,10 +248,7 @@ def write_parameters(path: Path, values: Mapping[str, Any]) -> None:
 
 
 def write_camera_file(
-    path: Path,
-    values: Mapping[str, Any],
-    lens: Mapping[str, Any],
-    remarks: Sequence[str] = (),
+    path: Path, values: Mapping[str, Any], lens: Mapping[str, Any], remarks: Sequence[str] = ()
 ) -> None:
     """Write the calibration of a camera or a rig, for ``--camera`` and ``camera_file``.
 

@@ -277,7 +277,7 @@ def test_no_input_crashes_or_warns(solver, points, pixels):
 
 
 def test_points_on_a_line_leave_no_rotation_that_is_none():
-    """Some of them had rotations with entries of 1e13 and more."""
+    """Two of 600 had rotations with entries of 1e14: those of seeds 60 and 263."""
     rng = np.random.default_rng(0)
     along = rng.uniform(-0.4, 0.4, 60)
     line = np.column_stack([along, 0.75 * along, np.full(60, 1.2)])
@@ -289,7 +289,7 @@ def test_points_on_a_line_leave_no_rotation_that_is_none():
         ),
         line,
     )
-    for seed in range(600):
+    for seed in (*range(50, 80), *range(250, 280)):
         noise = 0.4 * np.random.default_rng(seed).normal(size=pixels.shape)
         found = rsl.Localizer(camera()).localize(line, pixels + noise)
         if found:

@@ -33,7 +33,7 @@ def maps(draw: Any) -> Map:
     points = draw(arrays.arrays(np.float64, (count, 3), elements=st.floats(-1e8, 1e8)))
     numbers = st.lists(draw(st.sampled_from(IDS)), min_size=count, max_size=count, unique=True)
     ids = draw(st.none() | numbers)
-    width = draw(st.integers(1, 70))
+    width = draw(st.integers(1, 130))
     kind = draw(st.sampled_from([None, np.uint8, np.float32]))
     descriptors = None
     if kind is not None:

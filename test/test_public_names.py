@@ -54,6 +54,10 @@ def test_programs_start_with_light_imports(module):
         ("roi.width must be a whole", lambda localizer: rsl.Roi(0, 0, "5", 5)),
         ("expected_share must be be", lambda it: it.localize([], [], expected_share="0.5")),
         ("rotation must be of type R", lambda it: it.localize([], [], rotation=3)),
+        ("a: .points, pixels. or .po", lambda it: rsl.Localizer(
+            rsl.Rig({"a": it.camera}, {"a": (np.eye(3), np.zeros(3))})).localize({"a": 3})),
+        ("angular_velocity_deviation", lambda localizer: rsl.Prior(
+            angular_velocity=(0, 0, 1), angular_velocity_deviation="x")),
         ("aid must be of type Aid, g", lambda localizer: rsl.Tracker(localizer, aid=5)),
         ("max_prediction must be 0 s", lambda it: rsl.Tracker(it, max_prediction="1")),
         ("time_ns must be a whole nu", lambda localizer: rsl.Tracker(localizer).at(None)),

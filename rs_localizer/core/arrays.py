@@ -48,9 +48,10 @@ def instance(name: str, value: object, kind: type) -> None:
         )
 
 
-def real(
-    name: str, value: object, kind: str, low: float, high: float = np.finfo(float).max
-) -> None:
+_MOST = np.finfo(float).max
+
+
+def real(name: str, value: object, kind: str, low: float = -_MOST, high: float = _MOST) -> None:
     """Raise ``ValueError``, saying what was passed, unless ``low <= value <= high``."""
     if not (isinstance(value, Real) and low <= float(value) <= high):
         raise ValueError(f"{name} must be {kind}, got {value!r}")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn, Self
 import numpy as np
 
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
+from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray, real
 from rs_localizer.core.shake import FUNCTIONS, shake_at, shake_basis, within_rows
 from rs_localizer.core.shutter import Motion, carried, numbers_of
 from rs_localizer.core.state import ANGULAR, MOTION_PARAMETERS, PARAMETERS, TURN
@@ -170,8 +170,9 @@ class Estimate(Motion):
         Raises:
             ValueError: where the readout time is unknown.
         """
-        if not (math.isfinite(seconds) and self.span > 0.0):
-            raise ValueError(f"needs finite seconds and a span, got {seconds!r} and {self.span}")
+        real("seconds", seconds, "a finite number")
+        if not self.span > 0.0:
+            raise ValueError("the readout time is unknown, and so is the motion after the image")
         if abs(seconds) > _LONGEST_AWAY:
             raise ValueError(
                 f"{seconds:g} s from the middle row is too far: the time is in seconds, and no "

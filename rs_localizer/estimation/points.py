@@ -115,7 +115,7 @@ def checked_of_rig(
         raise ValueError("the frame has no image")
     exposure, checks = rig.exposure(tuple(parts), stamps), []
     for name, part in parts.items():
-        if len(part) not in (2, 3):
+        if not isinstance(part, Sequence) or len(part) not in (2, 3):
             raise ValueError(f"{name}: (points, pixels) or (points, pixels, scores) are needed")
         try:
             checks.append(checked(part[0], part[1], part[2] if len(part) == 3 else None))

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig, RefinementKind
-from rs_localizer.core.arrays import Array, Array1, Array2, Array3, IntArray, Out
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3, IntArray, Out, real
 from rs_localizer.core.camera import numbers
 from rs_localizer.core.rig import Rig
 from rs_localizer.core.rotation_prior import ROTATION, RotationPrior
@@ -152,11 +152,8 @@ class Prior:
                 raise ValueError(f"{name} has no direction: {vector!r}")
             deviation = getattr(self, f"{name}_deviation", 1.0)
             most, unit = _MOST_DEVIATION if name == "gravity" else (sys.float_info.max, "")
-            if not _LEAST_DEVIATION <= deviation <= most:
-                raise ValueError(
-                    f"{name}_deviation must lie between {_LEAST_DEVIATION:g} and {most:.3g}{unit}, "
-                    f"got {deviation}"
-                )
+            between = f"between {_LEAST_DEVIATION:g} and {most:.3g}{unit}"
+            real(f"{name}_deviation", deviation, between, _LEAST_DEVIATION, most)
 
 
 _NOTHING = Prior()

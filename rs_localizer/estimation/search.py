@@ -430,7 +430,7 @@ class MotionSearch:
     def optimize(
         self, observed: Observed, state: Array, first_scale: float, terms: PriorTerms,
         last_scale: float | None = None,
-    ) -> Candidate:
+    ) -> Candidate:  # fmt: skip
         """Optimize one state locally, down to the inlier threshold."""
         optimized, cost = optimize(
             state[None], np.zeros(1), observed.observations.packed, first_scale,

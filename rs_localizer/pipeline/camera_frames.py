@@ -19,12 +19,7 @@ from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.core.shake import within_rows
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior
-from rs_localizer.io.clouds import (
-    Correspondences,
-    Keypoints,
-    read_correspondences,
-    read_keypoints,
-)
+from rs_localizer.io.clouds import Correspondences, Keypoints, read_correspondences, read_keypoints
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.transforms import Transforms
 from rs_localizer.localizer import Localizer

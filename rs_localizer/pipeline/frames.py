@@ -15,9 +15,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from rs_localizer.config import (
-    NodeConfig,
-)
+from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice

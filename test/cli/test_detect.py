@@ -29,12 +29,7 @@ from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
 from rs_localizer.pipeline.marker_detector import FrameDetector, correspondences
 from rs_localizer.settings import load_params_file
 
-from ..markers.prints import (  # noqa: TID252 - Python has a package "test"
-    K,
-    chessboard_cells,
-    rectangle,
-    render,
-)
+from ..markers.prints import K, chessboard_cells, rectangle, render  # noqa: TID252 - Python has a package "test"
 
 CAMERA = Camera(320, 240, K)
 LENS = "1 PINHOLE 320 240 300 300 160 120\n"  # the first pixel's middle is at 0.5

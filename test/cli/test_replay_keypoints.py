@@ -61,10 +61,11 @@ def test_a_recording_of_everything(tmp_path, capsys, ran):
         np.testing.assert_allclose(found[name], found["clouds"][2:], atol=0.01)
 
 
-def test_a_recording_beside_its_map(tmp_path):
+def test_a_recording_beside_its_map(tmp_path, ran):
     flight, out = tmp_path / "flight", tmp_path / "poses"
     record(flight, "--keypoints", "--duration", "0.4", "--points", "200")
     words = ["--params", f"{flight}/parameters.yaml", "--map", f"{flight}/map.npz"]
+    assert "and no map; give one with --map" in ran("replay", flight, *words[:2], code=1).err
     assert main(["replay", str(flight), *words, "--out", str(out)]) == 0
     found = read_tum(out / "poses.txt")
     truth = read_motions(flight, "/truth/pose", "/truth/twist").poses

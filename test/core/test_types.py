@@ -123,7 +123,9 @@ def test_what_a_result_says_of_itself():
             found.at(tau)
     with pytest.raises(ValueError, match=r"2e\+07 s from the middle row is too far"):
         found.at_time(2e7)
-    with pytest.raises(ValueError, match="needs finite seconds and a span"):
+    with pytest.raises(ValueError, match="seconds must be a finite number, got '0'"):
+        found.at_time("0")
+    with pytest.raises(ValueError, match="the readout time is unknown"):
         replace(found, span=0.0).at_time(0.01)
     nothing = Failure(Reason.DEGENERATE, "a line")
     assert not nothing
