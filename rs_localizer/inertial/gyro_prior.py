@@ -46,13 +46,14 @@ from rs_localizer.estimation.linear_fit import BLOCKS, MIDDLE, TURNS
 from rs_localizer.estimation.prior import Prior, predicted, state_in
 from rs_localizer.estimation.window import MotionSample
 from rs_localizer.inertial.gravity import gravity_seen
-from rs_localizer.inertial.oddities import ComparedTurns, told_by_numbers
+from rs_localizer.inertial.oddities import LEANING, ComparedTurns, told_by_numbers
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.status import InertialSettings, InertialStatus
 from rs_localizer.inertial.turning import (
     BETWEEN,
     BIAS,
     DELAY,
+    MOUNT,
     WITHIN,
     GyroscopeErrors,
     Read,
@@ -330,7 +331,9 @@ class GyroscopeTrack:
             if often and self._age >= _WATCHED:
                 self._former = self.errors
                 self._begin()
-        # What was contradicted often agrees by chance where the camera hardly turns.
+        # What was contradicted often agrees by chance where the camera hardly turns; and what is
+        # far off is no linear error.
+        often = often or bool(np.linalg.norm(self.errors.mean[MOUNT]) > LEANING)
         reason = ImuReason.DISAGREES if often else ImuReason.DOUBTED
         self._unused = None if agrees and not often else Unused(reason, self._oddity())
         return self._unused is None

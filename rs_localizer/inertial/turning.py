@@ -67,7 +67,7 @@ _INDEPENDENT, _BELOW = 1.0 / 3.0, 1.5
 # Variance of a constant rate, over the mean square of readings; and of its slope, over that of the
 # last pieces, which may be few.
 _VAGUE, _STEEPER = 100.0, 4.0
-# Noise over the readings' mean square (variances) that rounding does not decide.
+# Noise over the readings' mean square, or (rad/s)^2, that rounding does not decide.
 _LEAST = 1e-9
 
 
@@ -108,7 +108,7 @@ def spectrum_of(times: Array, rates: Array, noise: float) -> Spectrum:
     parts = np.convolve(power[_SLOW:], np.full(band, 1.0 / band), "valid")
     least = parts.min(initial=0.0 if len(parts) == 0 else math.inf)
     least *= 1.0 + _BELOW * doubt / math.sqrt(max(_INDEPENDENT * band, 1.0))
-    variance = max(noise**2 / period, least, _LEAST * square)
+    variance = max(noise**2 / period, least, _LEAST * (1.0 + square))
     beside = power - variance
     own = 0.5 * (beside + np.hypot(beside, doubt * variance)) / length
     own[[0, -1]] *= 0.5
