@@ -22,13 +22,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.rate_spline import rotations_at_knots, spline, turns_at
 from rs_localizer.core.rotation_prior import NODES, parts_of
 from rs_localizer.core.shake import COMBINATIONS, MIDDLE_RATES, RESOLVED, shake_functions
@@ -81,18 +80,18 @@ class Spectrum(NamedTuple):
     slope: float  # (rad/s^2)^2 of its change
 
 
-def spectrum_of(times: Array, rates: Array, noise: float) -> Spectrum:
+def spectrum_of(times_ns: IntArray, rates: Array, noise: float) -> Spectrum:
     """Return the spectrum of a camera's rates by readings of some tenths of a second.
 
     Noise is what all frequencies have: the least that a part of the spectrum shows (Welch, "The use
     of fast Fourier transform for the estimation of power spectra", 1967).
 
     Args:
-        times: (n,) s.
+        times_ns: (n,).
         rates: (n,3) rad/s.
         noise: rad/s/sqrt(Hz), the least.
     """
-    period = float(times[-1] - times[0]) / (len(times) - 1)
+    period = 1e-9 * float(times_ns[-1] - times_ns[0]) / (len(times_ns) - 1)
     length = min(max(round(_ALIKE / period), _FEWEST), _MOST, len(rates))
     starts = np.arange(len(rates) - length, -1, -max(length // 2, 1))
     pieces = rates[starts[:, None] + np.arange(length)]
@@ -231,7 +230,7 @@ def read(
     times = np.asarray(1e-9 * (samples.times_ns[first:last] - here_ns), np.float64)
     period = float(times[-1] - times[0]) / (len(times) - 1)
     found = errors.corrected(samples.angular_velocity[first:last])
-    spectrum = spectrum_of(1e-9 * samples.times_ns, samples.angular_velocity, errors.noise)
+    spectrum = spectrum_of(samples.times_ns, samples.angular_velocity, errors.noise)
     aside = 1e-9 * reach_ns + MARGIN * period
     begin = int(times.searchsorted(-max(length, half) - aside))
     end = int(times.searchsorted(max(-length, half) + aside))
