@@ -71,7 +71,7 @@ _LEAST = 1e-9
 
 
 class Spectrum(NamedTuple):
-    """What readings tell of how a camera turns, and how noisy they are."""
+    """The rates of a camera by frequency, and the noise of readings, as they tell both."""
 
     frequencies: Array  # (f,) rad/s, evenly from 0
     variances: Array  # (f,) (rad/s)^2 of the camera's rates about an axis
