@@ -49,6 +49,7 @@ FAULTS: dict[str, Imu] = {
     "step 15 ms": Imu(step=0.015),
     "saturated": Imu(limit=0.5),
     "half as fast": Imu(scale=0.5),
+    "still": Imu(scale=0.0, bias=0.0, noise=0.0),
     "radians as degrees": Imu(scale=180.0 / math.pi),
     "degrees as radians": Imu(scale=math.pi / 180.0),
     "mount 20 deg": Imu(mount=_mount(20)),

@@ -333,7 +333,9 @@ class Imu:
         0.035, "Standard deviation of the rotation between IMU and camera, in rad", (1e-4, 0.5)
     )
     gyroscope_noise: float = setting(
-        2e-4, "Noise density of the gyroscope, in rad/s/sqrt(Hz)", (1e-7, 1.0)
+        2e-4,
+        "Least noise density of the gyroscope, in rad/s/sqrt(Hz); more is learned",
+        (1e-7, 1.0),
     )
     gyroscope_bias_walk: float = setting(
         1e-4, "Random walk of the gyroscope's bias, in rad/s^2/sqrt(Hz)", (0.0, 1.0)

@@ -496,22 +496,24 @@ class Tracker:
         Returns:
             what was found, the prior that it was found with, and what its points tell.
         """
-        if foreseen is None or self.aid is None:
-            alone = self._prior(time_ns, None, span, context)
-            found = find(alone, None)
-            return found, alone, self._told(time_ns, found, alone, None)
-        rotation = foreseen.rotation
-        prior = foreseen.prior or self._prior(time_ns, rotation, span, context)
-        found = find(prior, rotation)
-        told = self._told(time_ns, found, prior, rotation)
-        if found and told is not None and self.aid.agrees(foreseen, found, told):
-            return found, prior, told
+        found: Estimate | Failure | None = None
+        if foreseen is not None and self.aid is not None and not self.aid.contradicted:
+            rotation = foreseen.rotation
+            prior = foreseen.prior or self._prior(time_ns, rotation, span, context)
+            found = find(prior, rotation)
+            told = self._told(time_ns, found, prior, rotation)
+            # Far from where it was expected, a frame before a plane agrees with any rotation.
+            free = foreseen.prior is None or foreseen.prior.motion is None
+            if found and told is not None and (free or found.tracked):
+                if self.aid.agrees(foreseen, found, told):
+                    return found, prior, told
+                foreseen = None  # and is judged
         alone = self._prior(time_ns, None, span, context)
         other = find(alone, None)
-        if not other:
+        if not other and found is not None:
             return found, prior, told
         told = self._told(time_ns, other, alone, None)
-        if told is not None and not found:
+        if other and told is not None and foreseen is not None and self.aid is not None:
             self.aid.agrees(foreseen, other, told)
         return other, alone, told
 

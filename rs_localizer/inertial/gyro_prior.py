@@ -46,13 +46,14 @@ from rs_localizer.estimation.linear_fit import BLOCKS, MIDDLE, TURNS
 from rs_localizer.estimation.prior import Prior, predicted, state_in
 from rs_localizer.estimation.window import MotionSample
 from rs_localizer.inertial.gravity import gravity_seen
-from rs_localizer.inertial.oddities import ComparedTurns, told_by_numbers
+from rs_localizer.inertial.oddities import LEANING, ComparedTurns, told_by_numbers
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.status import InertialSettings, InertialStatus
 from rs_localizer.inertial.turning import (
     BETWEEN,
     BIAS,
     DELAY,
+    MOUNT,
     WITHIN,
     GyroscopeErrors,
     Read,
@@ -324,19 +325,26 @@ class GyroscopeTrack:
         agrees = bool(far <= 1.0)
         self._contradictions.append(not agrees)
         self._age += 1
-        often = self._contradicted()
         if not agrees:
             self.forget_motion()
-            if often and self._age >= _WATCHED:
+            if sum(self._contradictions) >= _CONTRADICTIONS and self._age >= _WATCHED:
                 self._former = self.errors
                 self._begin()
         # What was contradicted often agrees by chance where the camera hardly turns.
-        reason = ImuReason.DISAGREES if often else ImuReason.DOUBTED
-        self._unused = None if agrees and not often else Unused(reason, self._oddity())
-        return self._unused is None
+        reason = ImuReason.DISAGREES if self.contradicted else ImuReason.DOUBTED
+        is_used = agrees and not self.contradicted
+        self._unused = None if is_used else Unused(reason, self._oddity())
+        return is_used
 
-    def _contradicted(self) -> bool:
-        """Return whether images contradict it, or have, and what it is off by is hard to learn."""
+    @property
+    def contradicted(self) -> bool:
+        """Whether images contradict it, or what it is off by is hard to learn."""
+        # What leans far is off by more than a linear error.
+        leans = float(np.linalg.norm(self.errors.mean[MOUNT])) > LEANING
+        return leans or self._is_another()
+
+    def _is_another(self) -> bool:
+        """Return whether images contradict it, or have, and their turns tell why."""
         often = sum(self._contradictions) >= _CONTRADICTIONS
         return often or (self._former is not None and self._turns.told() != "")
 
@@ -363,7 +371,7 @@ class GyroscopeTrack:
 
     def _oddity(self) -> str:
         """Return in words what it has that the settings hardly allow for; empty: nothing."""
-        if self._contradicted():
+        if self._is_another():
             return self._turns.told()
         return told_by_numbers(self.errors, self._before_all.diagonal(), self._former)
 

@@ -32,7 +32,9 @@ _MOST_DEVIATION = 0.1
 _CERTAIN = {1: 10.83, 3: 16.27}
 # Rates of so many times the camera's are those of another unit. Rates and mounts (rad) that are
 # closer than these to the camera's are learned from frame to frame.
-_DEGREES, _FASTER, _LEANING = math.degrees(1.0), math.log(1.4), 0.25
+_DEGREES, _FASTER, LEANING = math.degrees(1.0), math.log(1.4), 0.25
+# Part of a camera's rates that is none, if the camera turns faster than its noise (rad/s).
+_STILL, _TURNING = 0.003, 0.1
 
 
 def told_by_numbers(errors: GyroscopeErrors, allowed: Array, before: GyroscopeErrors | None) -> str:
@@ -96,7 +98,9 @@ class ComparedTurns:
             return self._told
         shown, camera = np.split(np.array(self._rates), [4], axis=1)
         shown[:, :3] -= shown[:, :3].mean(axis=0)
-        known = shown.T @ shown
+        known, turns = shown.T @ shown, camera - camera.mean(axis=0)
+        if known[:3, :3].trace() < _STILL**2 * np.sum(turns**2) and np.std(turns) > _TURNING:
+            self._told = "it always shows the same rates"
         if np.linalg.cond(known) > 1e12:
             return self._told
         found = np.linalg.solve(known, shown.T @ camera)
@@ -113,7 +117,7 @@ def _axes(turn: Array) -> str:
     nearest = np.where(np.abs(turn) == np.abs(turn).max(axis=1)[:, None], np.sign(turn), 0.0)
     if np.array_equal(nearest, np.eye(3)):
         angle = so3.log(np.ascontiguousarray(turn))
-        return _mount(angle) if float(np.linalg.norm(angle)) > _LEANING else ""
+        return _mount(angle) if float(np.linalg.norm(angle)) > LEANING else ""
     if not np.array_equal(nearest @ nearest.T, np.eye(3)):
         return ""
     axes = [("-" if row.sum() < 0.0 else "") + "xyz"[np.abs(row).argmax()] for row in nearest]

@@ -22,13 +22,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.rate_spline import rotations_at_knots, spline, turns_at
 from rs_localizer.core.rotation_prior import NODES, parts_of
 from rs_localizer.core.shake import COMBINATIONS, MIDDLE_RATES, RESOLVED, shake_functions
@@ -57,30 +56,89 @@ _USUAL_NOISE, _SIZE = 1e-13, 0.003
 # Row times at which rates are compared.
 _TAU = np.linspace(-0.5, 0.5, 41)
 
-# End of the spectrum, as a part of the sample rate, and noise beside it (variance).
-_BAND, _NOISE = 0.4, 1e-5
-# With more samples than this about an exposure they are dense enough, and solving for them would
-# take time.
-_MOST = 64
+# s of readings that are alike: of a spectrum's pieces, and so many readings at least and at most.
+_ALIKE, _FEWEST, _MOST = 0.16, 16, 128
+# Into so many parts of a spectrum its noise is looked for; the first cycles of a piece show motion.
+_BANDS, _SLOW = 8, 6
+# Frequencies of a band that tell of noise independently (Harris, 1978, of this taper), per band's
+# length; and deviations that the least of some eight means lies below the mean.
+_INDEPENDENT, _BELOW = 1.0 / 3.0, 1.5
+# Variance of a constant rate, over the mean square of readings; and of its slope, over that of the
+# last pieces, which may be few.
+_VAGUE, _STEEPER = 100.0, 4.0
+# Noise over the readings' mean square, or (rad/s)^2, that rounding does not decide.
+_LEAST = 1e-9
 
 
-def densified(times: Array, rates: Array) -> tuple[Array, Array]:
-    """Return times (2 n - 1,) and rates (2 n - 1,3): the given ones, and one between each two.
+class Spectrum(NamedTuple):
+    """The rates of a camera by frequency, and the noise of readings, as they tell both."""
+
+    frequencies: Array  # (f,) rad/s, evenly from 0
+    variances: Array  # (f,) (rad/s)^2 of the camera's rates about an axis
+    noise: float  # (rad/s)^2 of a reading about an axis
+    constant: float  # (rad/s)^2 of a constant rate about an axis
+    slope: float  # (rad/s^2)^2 of its change
+
+
+def spectrum_of(times_ns: IntArray, rates: Array, noise: float) -> Spectrum:
+    """Return the spectrum of a camera's rates by readings of some tenths of a second.
+
+    Noise is what all frequencies have: the least that a part of the spectrum shows (Welch, "The use
+    of fast Fourier transform for the estimation of power spectra", 1967).
 
     Args:
-        times: (n,) increasing, s; they need not be regular.
-        rates: (n,3) at these times.
+        times_ns: (n,).
+        rates: (n,3) rad/s.
+        noise: rad/s/sqrt(Hz), the least.
     """
-    if not 3 < len(times) <= _MOST:
-        return times, rates
-    dense = np.empty(2 * len(times) - 1)
-    dense[::2], dense[1::2] = times, 0.5 * (times[1:] + times[:-1])
-    per_second, mean = 2.0 * _BAND / float(np.median(np.diff(times))), rates.mean(axis=0)
-    alike = np.sinc(per_second * (dense[:, None] - times))
-    known = alike[::2] + _NOISE * np.eye(len(times))
-    found = alike @ np.linalg.solve(known, rates - mean) + mean
-    found[::2] = rates
-    return dense, found
+    period = 1e-9 * float(times_ns[-1] - times_ns[0]) / (len(times_ns) - 1)
+    length = min(max(round(_ALIKE / period), _FEWEST), _MOST, len(rates))
+    starts = np.arange(len(rates) - length, -1, -max(length // 2, 1))
+    pieces = rates[starts[:, None] + np.arange(length)]
+    line = np.linalg.qr(np.vander(np.arange(length) - 0.5 * length, 2))[0]
+    taper = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
+    lines = line.T @ pieces
+    pieces = (pieces - line @ lines) * taper[:, None]
+    shown = np.abs(np.fft.rfft(pieces, 2 * length, axis=1)) ** 2
+    power = shown.mean(axis=(0, 2)) / (taper @ taper)  # of white noise: its variance
+    # Deviations over means: of a frequency, and of a band.
+    doubt = 1.0 / math.sqrt(3 * len(pieces))
+    band, square = max(length // _BANDS, 1), float(np.mean(rates**2))
+    parts = np.convolve(power[_SLOW:], np.full(band, 1.0 / band), "valid")
+    least = parts.min(initial=0.0 if len(parts) == 0 else math.inf)
+    least *= 1.0 + _BELOW * doubt / math.sqrt(max(_INDEPENDENT * band, 1.0))
+    variance = max(noise**2 / period, least, _LEAST * (1.0 + square))
+    beside = power - variance
+    own = 0.5 * (beside + np.hypot(beside, doubt * variance)) / length
+    own[[0, -1]] *= 0.5
+    cycles = np.arange(length + 1) / (2 * length * period)
+    slope = max(float(np.mean(lines[:, 0] ** 2)) - variance, doubt * variance)
+    slope *= _STEEPER * 12.0 / (length**3 * period**2)
+    constant = _VAGUE * (square + variance)
+    return Spectrum(2.0 * np.pi * cycles, own, variance, constant, slope)
+
+
+def smoothed(
+    times: Array, rates: Array, wanted: Array, rows: Array, spectrum: Spectrum
+) -> tuple[Array, Array]:
+    """Return the rates (w,3) at wanted times by readings (n,3), and a covariance (r,r) of an axis.
+
+    Args:
+        times: (n,) of the readings, s.
+        wanted: (w,) s.
+        rows: (r,) s, of the covariance.
+    """
+    every = np.concatenate([times, wanted, rows])
+    turning = np.exp(1j * spectrum.frequencies[1] * every)[:, None]
+    waves = np.cumprod(np.repeat(turning, len(spectrum.frequencies) - 1, axis=1), axis=1)
+    waves *= np.sqrt(spectrum.variances[1:])
+    ones = np.full(len(every), math.sqrt(spectrum.constant + spectrum.variances[0]))
+    shown = np.column_stack([waves.real, waves.imag, ones, math.sqrt(spectrum.slope) * every])
+    own, other, last = np.split(shown, [len(times), len(times) + len(wanted)])
+    known = own @ own.T + spectrum.noise * np.eye(len(times))
+    told = np.linalg.solve(known, np.hstack([rates, own @ last.T]))
+    left = last @ last.T - (last @ own.T) @ told[:, 3:]
+    return other @ (own.T @ told[:, :3]), left
 
 
 def _parts_by_rates() -> tuple[Array, Array, Array]:
@@ -172,15 +230,21 @@ def read(
     times = np.asarray(1e-9 * (samples.times_ns[first:last] - here_ns), np.float64)
     period = float(times[-1] - times[0]) / (len(times) - 1)
     found = errors.corrected(samples.angular_velocity[first:last])
-    reach = half + 1e-9 * reach_ns + MARGIN * period
-    near = slice(int(times.searchsorted(-reach)), int(times.searchsorted(reach)))
+    spectrum = spectrum_of(samples.times_ns, samples.angular_velocity, errors.noise)
+    aside = 1e-9 * reach_ns + MARGIN * period
+    begin = int(times.searchsorted(-max(length, half) - aside))
+    end = int(times.searchsorted(max(-length, half) + aside))
+    near = slice(max(min(begin, end - len(spectrum.frequencies)), 0), end)
+    finer = np.empty(2 * len(times[near]) - 1)
+    finer[::2], finer[1::2] = times[near], 0.5 * (times[near][1:] + times[near][:-1])
+    grid = readout_time * _TAU
+    smooth, spread = smoothed(times[near], found[near], finer, grid, spectrum)
     dense, found = (
         np.concatenate([of[: near.start], within, of[near.stop :]])
-        for of, within in zip((times, found), densified(times[near], found[near]), strict=True)
+        for of, within in zip((times, found), (finer, smooth), strict=True)
     )
     delays, weights = _delays(deviation, period)
     # All that follows is by readings that are so much later.
-    grid = readout_time * _TAU
     cubics = spline(dense, found)
     knots = rotations_at_knots(dense, cubics)
     moments = np.append(grid, [0.0, -length]) + delays[:, None]
@@ -205,7 +269,8 @@ def read(
     usual = (weights @ rates.reshape(len(delays), -1)).reshape(-1, 3)
     within = readout_time * errors.derivatives(usual / readout_time)
     by_errors[WITHIN] += (_PARTS @ within.reshape(len(usual), -1)).reshape(-1, PARAMETERS)
-    rest[WITHIN, WITHIN] += _noise(errors.noise**2 * readout_time)
+    spread = _PARTS @ (readout_time**2 * spread) @ _PARTS.T
+    rest[WITHIN, WITHIN] += np.kron(spread, np.eye(3))
     between = None
     if length != 0.0:
         between = np.ascontiguousarray(turns[-1].T)
@@ -214,7 +279,7 @@ def read(
         by_rate = length * so3.right_jacobian(angle)
         by_errors[BETWEEN] += by_rate @ errors.derivatives(angle / length)[0]
         mean[BETWEEN] = angle
-        rest[BETWEEN, BETWEEN] += errors.noise**2 * abs(length) * np.eye(3)
+        rest[BETWEEN, BETWEEN] += spectrum.noise * period * abs(length) * np.eye(3)
     squares = np.square(mean).reshape(-1, 3).sum(axis=1)
     rest[np.diag_indices(len(rest))] += _SKEW**2 * np.repeat(squares, 3)
     rest += _JITTER**2 * np.outer(by_errors[:, DELAY.start], by_errors[:, DELAY.start])
@@ -235,10 +300,3 @@ def _at(wanted: Array, times: Array, values: Array) -> Array:
     """Return values (...,3) between those (n,3) at times (n,); beyond them the last one."""
     found = [np.interp(wanted, times, values[:, axis]) for axis in range(3)]
     return np.stack(found, axis=-1)
-
-
-@cache
-def _noise(variance: float) -> Array:
-    """Return the covariance (60,60) of a rotation by the white noise of its rate."""
-    noisy = _KNOWN / max(variance, _LEAST_NOISE) + _PRIOR
-    return np.kron(np.linalg.inv(noisy), np.eye(3))

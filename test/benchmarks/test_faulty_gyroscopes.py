@@ -30,6 +30,7 @@ def alone():
         ("scale 5 %", "it turns 5 % too fast"),
         ("scale 20 %", "it turns 20 % too fast"),
         ("mount 10 deg", "its mount is 10 deg off"),
+        ("mount 20 deg", "its mount is 20 deg off"),
         ("late 40 ms", "its stamps are 40 ms late"),
         ("step 15 ms", "its stamps stepped by 16 ms"),
         ("saturated", "saturated"),

@@ -16,7 +16,7 @@ from benchmarks.independent.scenes import Rich
 from rs_localizer.inertial.gyro_prior import GyroscopeTrack
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.status import InertialSettings
-from rs_localizer.inertial.turning import GyroscopeErrors
+from rs_localizer.inertial.turning import GyroscopeErrors, smoothed, spectrum_of
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.pose_at_time import twist_at
 from rs_localizer.tracking import Tracker
@@ -143,3 +143,30 @@ def test_behind_the_last_row_the_camera_turns_on(held):
             off.append(np.subtract(*(one.angular_velocity for one in moved)))
     off = np.degrees(np.linalg.norm(off, axis=1)) / Camera().readout_time
     assert np.median(off) < 1.0  # 4.8 deg/s where the motion of the frames so far is carried on
+
+
+@pytest.mark.parametrize(("motion", "noise"), [(hand, 1e-3), (rest, 5e-3)])
+def test_noise_that_nobody_declared_is_learned(motion, noise):
+    noisy = record(Camera(), motion, Rich(), (1, 40), 2, Imu(noise=noise))
+    found = followed(replace(noisy, imu=Imu()), 40)
+    assert np.mean(rate_errors(noisy, found, 5)[1] < 7.81) >= 0.9
+    assert not any(status.oddity for status, _ in found)
+
+
+@pytest.mark.parametrize("rate", [200.0, 400.0, 1000.0])
+def test_readings_tell_their_noise_and_how_well_they_tell_rates(rate):
+    rng, times = np.random.default_rng(1), np.arange(0.0, 0.6, 1.0 / rate)
+    noise, wanted = 1e-3, np.linspace(0.55, 0.58, 31)
+
+    def true(time):
+        return np.stack([np.sin(9.0 * time + k) + np.sin(250.0 * time - k) for k in range(3)], -1)
+
+    squared = []
+    for _ in range(20):
+        rates = true(times) + noise * np.sqrt(rate) * rng.normal(size=(len(times), 3))
+        spectrum = spectrum_of(np.rint(1e9 * times).astype(np.int64), rates, 1e-4)
+        assert np.sqrt(spectrum.noise / rate) == pytest.approx(noise, rel=0.35)
+        near = slice(-len(spectrum.frequencies), None)
+        mean, covariance = smoothed(times[near], rates[near], wanted, wanted, spectrum)
+        squared.append((mean - true(wanted)) ** 2 / covariance.diagonal()[:, None])
+    assert 0.5 < np.mean(squared) < 1.5

@@ -57,6 +57,7 @@ QUARTER = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         (2.0 * np.eye(3), "it shows 2 times the camera's rates"),
         (57.3 * np.eye(3), "it shows 5. times the camera's rates: degrees, not radians"),
         (np.eye(3) / 57.3, "it shows 0.01. times the camera's rates: not degrees"),
+        (np.zeros((3, 3)), "it always shows the same rates"),
         (np.diag([1.0, -1.0, -1.0]), "the camera's x y z are its x -y -z"),
         (QUARTER, "the camera's x y z are its -y x z"),
         (
