@@ -20,14 +20,14 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Rig, RigEstimate
 from rs_localizer.core.rotation_prior import RotationPrior
-from rs_localizer.core.state import POSE, VELOCITIES, rotation_of, step_between
+from rs_localizer.core.state import PARAMETERS, POSE, VELOCITIES, rotation_of, step_between
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.acceptance import (
     estimate_of,
     noise_fills,
     refusal,
-    sample_estimate,
     speeding,
+    too_few,
     uncertain,
     unfit,
 )
@@ -308,14 +308,21 @@ class Localizer:
         if not best.found:
             return Failure(Reason.NO_HYPOTHESIS, "no three points gave a pose")
         if self.config.refinement == RefinementKind.NONE:
-            return sample_estimate(
-                observed, best.state, best.samples, self.config.inlier_threshold,
-                self.config.min_inliers,
-            )  # fmt: skip
+            return self._minimal(observed, best)
         # 4. Maximum a posteriori on the inliers; rest or motion; the leans of a plane.
         posterior = self._settle(observed, best, observed.terms)
         # 5. Nothing rather than a wrong pose.
         return self._accept(observed, best, posterior)
+
+    def _minimal(self, observed: Observed, best: Candidate) -> Estimate | Failure:
+        """Return the model of a minimal sample as it is, without a covariance."""
+        errors, needed = observed.observations.squared_errors(best.state), self.config.min_inliers
+        inliers = errors < self.config.inlier_threshold**2
+        if np.count_nonzero(inliers) < needed:
+            return too_few(inliers, errors, best.samples, needed)
+        unknown = np.full((PARAMETERS, PARAMETERS), math.nan)
+        posterior = Posterior(best.state, unknown, math.nan, 0.0, math.nan, inliers, errors)
+        return estimate_of(observed, posterior, best.samples, NO_EFFECT, predicted=True)
 
     def _track(self, observed: Observed, prior: Prior, expected_share: float) -> Estimate | Failure:
         """Find the motion nearest to the prior one, if the points agree with it."""

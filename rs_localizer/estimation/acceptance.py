@@ -87,7 +87,7 @@ def refusal(
     """
     found = int(np.count_nonzero(posterior.inliers))
     if found < min_inliers:
-        return _too_few(posterior.inliers, posterior.squared_errors, samples, min_inliers)
+        return too_few(posterior.inliers, posterior.squared_errors, samples, min_inliers)
     if not posterior.determined:
         return Failure(
             Reason.DEGENERATE,
@@ -111,7 +111,7 @@ def refusal(
     return None
 
 
-def _too_few(inliers: BoolArray, squared_errors: Array, samples: int, needed: int) -> Failure:
+def too_few(inliers: BoolArray, squared_errors: Array, samples: int, needed: int) -> Failure:
     """Return the failure of a motion with too few inliers."""
     behind, count = int(np.count_nonzero(np.isinf(squared_errors))), len(inliers)
     if 2 * behind > count:
@@ -162,46 +162,6 @@ _TOLD = 0.5
 _CERTAIN = 0.95
 
 
-def sample_estimate(
-    observed: Observed, state: Array, samples: int, threshold: float, fewest: int
-) -> Estimate | Failure:
-    """Return the estimate of a minimal sample's model as it is, without a covariance.
-
-    Args:
-        state: (24,) of the model.
-        samples: minimal samples drawn.
-        threshold: px, of inliers.
-        fewest: inliers of an accepted pose.
-    """
-    errors = observed.observations.squared_errors(state)
-    inliers = errors < threshold**2
-    if np.count_nonzero(inliers) < fewest:
-        return _too_few(inliers, errors, samples, fewest)
-    rotation = rotation_of(state)
-    inliers, residuals = _of_all(observed, inliers, errors)
-    return Estimate(
-        rotation=rotation,
-        translation=state[STATE_TRANSLATION] - rotation @ observed.centre,
-        angular_velocity=state[STATE_ANGULAR],
-        linear_velocity=state[STATE_LINEAR],
-        inliers=inliers,
-        residuals=residuals,
-        joint_covariance=np.full((PARAMETERS, PARAMETERS), np.nan),
-        iterations=samples,
-        span=observed.exposure.span,
-    )
-
-
-def _of_all(
-    observed: Observed, inliers: BoolArray, squared_errors: Array
-) -> tuple[BoolArray, Array]:
-    """Return inliers and residuals of all points that were given, by those of the usable ones."""
-    usable, count = observed.usable, len(observed.points)
-    residuals, every = np.full(count, np.nan), np.zeros(count, dtype=np.bool_)
-    residuals[usable.indices], every[usable.indices] = np.sqrt(squared_errors), inliers
-    return every[usable.originals], residuals[usable.originals]
-
-
 def estimate_of(
     observed: Observed, posterior: Posterior, samples: int, effect: CalibrationEffect,
     predicted: bool,
@@ -215,15 +175,14 @@ def estimate_of(
     """
     state, known = posterior.state, observed.rotation
     rotation = rotation_of(state)
-    inliers, residuals = _of_all(observed, posterior.inliers, posterior.squared_errors)
+    indices, originals, count = *observed.usable[:2], len(observed.points)
+    residuals, inliers = np.full(count, np.nan), np.zeros(count, dtype=np.bool_)
+    residuals[indices], inliers[indices] = np.sqrt(posterior.squared_errors), posterior.inliers
     rate, change = state[STATE_ANGULAR], state[STATE_ANGULAR_ACCELERATION]
     covariance = posterior.covariance
     # The noise of this frame is an estimate, and what is on an arc leaves its tangent.
-    motion, arched = covariance[:PARAMETERS, :PARAMETERS].copy(), posterior.arched
-    if arched is None:
-        alone = np.zeros((1, PARAMETERS)), motion[None]
-        arched = along_arcs(motion, state[STATE_TRANSLATION], np.ones(1), *alone)
-    beside = posterior.inflation * arched - motion
+    motion = covariance[:PARAMETERS, :PARAMETERS].copy()
+    beside = posterior.inflation * along_arcs(motion, state[STATE_TRANSLATION]) - motion
     shake = posterior.shake
     if known is not None:
         rate, change, shake = known.joined(rate, change, shake)
@@ -236,8 +195,8 @@ def estimate_of(
         linear_velocity=state[STATE_LINEAR],
         angular_acceleration=change,
         linear_acceleration=state[STATE_LINEAR_ACCELERATION],
-        inliers=inliers,
-        residuals=residuals,
+        inliers=inliers[originals],
+        residuals=residuals[originals],
         joint_covariance=covariance,
         undetected_covariance=posterior.undetected + beside[:MOTION_PARAMETERS, :MOTION_PARAMETERS],
         shake=shake,

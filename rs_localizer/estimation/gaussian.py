@@ -90,9 +90,6 @@ class Mixture(NamedTuple):
     covariance: Array  # (18 + t,18 + t)
     evidence: float  # logarithm of the sum
     probable: Array  # (k,) weights in the mean
-    possible: Array  # (k,) weights in the covariance
-    offsets: Array  # (k,18) from the mean
-    covariances: Array  # (k,18,18) of the offsets
 
 
 @entry
@@ -125,41 +122,31 @@ def mixture(parts: Gaussians, preferences: Array1, temper: float) -> Mixture:
     # About the pivot, which the move of a step is not.
     state[9:12] = pivot - mean[3:6] + hat_of(pivot) @ mean[:3]
     pivot[:], by_step, away = state[9:12], np.eye(6), np.empty(size)
-    offsets, covariance = np.empty((count, PARAMETERS)), np.zeros((size, size))
-    covariances = np.empty((count, PARAMETERS, PARAMETERS))
+    covariance = np.zeros((size, size))
     for k in range(count):
-        offsets[k], by_step[:, :3] = offset_between(state, parts.states[k], pivot)
-        away[:PARAMETERS], away[PARAMETERS:] = offsets[k], parts.turns[k] - turn
+        away[:PARAMETERS], by_step[:, :3] = offset_between(state, parts.states[k], pivot)
+        away[PARAMETERS:] = parts.turns[k] - turn
         # Covariances of steps as those of offsets, which go with the turn.
         about = parts.covariances[k].copy()
         about[:6] = by_step @ about[:6]
         about[:, :6] = about[:, :6].copy() @ by_step.T
-        covariances[k] = about[:PARAMETERS, :PARAMETERS]
         for i in range(size):
             for j in range(size):
                 covariance[i, j] += possible[k] * (about[i, j] + away[i] * away[j])
-    return Mixture(state, turn, covariance, evidence, probable, possible, offsets, covariances)
+    return Mixture(state, turn, covariance, evidence, probable)
 
 
 @entry
-def along_arcs(
-    covariance: Array2, centre: Array1, weights: Array1, offsets: Array2, covariances: Array3
-) -> Array:
+def along_arcs(covariance: Array2, centre: Array1) -> Array:
     """Return the covariance to second order in the move; the rotation has no second order.
 
-    The second order of a mixture is not that of one Gaussian: a hypothesis that rotated by three
-    deviations moved nine times as far off the tangent as one that rotated by one. The mean stays
-    where the points fit best, so that the mean of the second order counts, too. Let ``s_i = y^T H_i
-    y`` for Gaussians ``y`` with mean ``m`` and covariance ``C``. Then ``E[s_i]`` is ``tr(H_i C) +
-    m^T H_i m``, and ``E[y s_i]`` is ``m E[s_i] + 2 C H_i m``. The mean of ``s_i s_j`` is ``E[s_i]
-    E[s_j] + 2 tr(H_i C H_j C) + 4 m^T H_i C H_j m``.
+    The mean stays where the points fit best, so that the mean of the second order counts, too. Let
+    ``s_i = y^T H_i y`` for a Gaussian ``y`` about zero with covariance ``C``. Then ``E[s_i]`` is
+    ``tr(H_i C)``, and the mean of ``s_i s_j`` is ``E[s_i] E[s_j] + 2 tr(H_i C H_j C)``.
 
     Args:
         covariance: (18,18), of a step.
         centre: (3,) of the points, in camera axes.
-        weights: (k,) of Gaussians whose mixture it is.
-        offsets: (k,18) of their means (:func:`offset_between`).
-        covariances: (k,18,18) of the offsets.
     """
     # y = (phi, d): d = -rho + [p]x phi, and the forms H_i.
     by_step, forms = np.diag(np.repeat(np.array([1.0, -1.0]), 3)), np.zeros((3, 6, 6))
@@ -172,24 +159,13 @@ def along_arcs(
             forms[i, axis, axis] += 0.5 * centre[i]
             forms[i, i, axis] -= 0.25 * centre[axis]
             forms[i, axis, i] -= 0.25 * centre[axis]
-    farther, products = covariance.copy(), np.empty((3, 6, 6))
-    pulls, sizes = np.empty((3, 6)), np.empty(3)
-    for n in range(len(weights)):
-        mean, crossed = by_step @ offsets[n, :6], by_step @ covariances[n, :6]
-        both = crossed[:, :6].copy() @ by_step.T
-        for i in range(3):
-            products[i], pulls[i] = forms[i] @ both, forms[i] @ mean
-            sizes[i] = np.trace(products[i]) + np.sum(pulls[i] * mean)
-        told = pulls @ both @ pulls.T
-        along = 2.0 * pulls @ crossed
-        for i in range(3):
-            for j in range(3):
-                second = 4.0 * told[i, j] + 2.0 * np.sum(products[i] * products[j].T)
-                farther[3 + i, 3 + j] += weights[n] * (second + sizes[i] * sizes[j])
-            for k in range(PARAMETERS):
-                first = weights[n] * (along[i, k] + sizes[i] * offsets[n, k])
-                farther[3 + i, k] += first
-                farther[k, 3 + i] += first
+    farther, both = covariance.copy(), by_step @ covariance[:6, :6].copy() @ by_step.T
+    for i in range(3):
+        one = forms[i] @ both
+        for j in range(3):
+            other = forms[j] @ both
+            second = np.trace(one) * np.trace(other) + 2.0 * np.sum(one * other.T)
+            farther[3 + i, 3 + j] += second
     return farther
 
 

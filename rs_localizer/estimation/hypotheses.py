@@ -21,14 +21,12 @@ from rs_localizer.core.state import (
     PARAMETERS,
     POSE,
     POSE_SIZE,
-    STATE_TRANSLATION,
     VELOCITIES,
     step_between,
 )
 from rs_localizer.estimation.gaussian import (
     Frame,
     Gaussians,
-    along_arcs,
     linear_at,
     mixture,
     mode_of,
@@ -119,8 +117,6 @@ class Posterior(NamedTuple):
     speeding: float = 0.0  # squared velocities, in deviations of what the configuration expects
     # Probabilities of the typical speeds; empty: the configured one
     speeds: Array = np.zeros(0)
-    # (18,18) with the second order of arcs, of a mixture; None: of the covariance as a Gaussian's
-    arched: Array | None = None
     # (12,12) of pose and velocities, beside the covariance: vibration that hides in the noise
     undetected: Array = np.zeros((12, 12))
     # (k,) logarithms of the evidence of each vibration, against none; empty: not looked at
@@ -457,11 +453,7 @@ def _mixed(given: _Given, groups: list[_Camera]) -> Posterior:
         shake = COMBINATIONS @ found.turn.reshape(-1, 3)
     if not len(likely.squared_errors):  # of all steady ones, and not of the best one alone
         likely = likely._replace(squared_errors=given.observations.squared_errors(found.state))
-    arched = along_arcs(
-        found.covariance[:PARAMETERS, :PARAMETERS].copy(), found.state[STATE_TRANSLATION],
-        found.possible, found.offsets, found.covariances,
-    )  # fmt: skip
-    return likely._replace(state=found.state, covariance=covariance, arched=arched, shake=shake)
+    return likely._replace(state=found.state, covariance=covariance, shake=shake)
 
 
 def _of_all(groups: list[_Camera]) -> tuple[Array, Array]:

@@ -244,26 +244,8 @@ def _transposed(matrix: list[Vector], vector: Vector) -> Vector:
     return [dot(vector, [matrix[i][j] for i in range(3)]) for j in range(3)]
 
 
-def still_cost(values: Sequence[Lanes]) -> Any:
-    """Return :attr:`View.truncated` of a camera at rest, which takes less."""
-    point, ray, by_ray = values[0:3], values[3:5], [values[6:8], values[8:10]]
-    state = values[POINT_SIZE : POINT_SIZE + STATE_SIZE]
-    moved = multiply([state[0:3], state[3:6], state[6:9]], point)
-    rig_point = [a + b for a, b in zip(moved, state[9:12], strict=True)]
-    x, y, z = _seen(rig_point, _matrix(values[AXES:CENTRE]), values[CENTRE:POINT_SIZE])
-    inverse_depth = 1.0 / z
-    offset = [x * inverse_depth - ray[0], y * inverse_depth - ray[1]]
-    error = multiply(by_ray, offset)
-    squared, scale = dot(error, error), values[POINT_SIZE + STATE_SIZE]
-    return values[WEIGHT] * select((z > 0.0) & (squared < scale), squared, scale)
-
-
 # Blocks that stay in the fast caches at a time.
 _CHUNK = 32
-
-
-def _tile(higher: range, lower: range) -> list[tuple[int, int]]:
-    return [(i, j) for i in higher for j in lower if j <= i]
 
 
 def _tiles(parameters: int) -> list[list[tuple[int, int]]]:
@@ -272,7 +254,8 @@ def _tiles(parameters: int) -> list[list[tuple[int, int]]]:
     groups = [range(k, min(k + 4, columns)) for k in range(0, columns, 4)]
     if len(groups[-1]) == 1:
         groups[-2:] = [range(groups[-2].start, columns)]
-    return [_tile(groups[a], groups[b]) for a in range(len(groups)) for b in range(a + 1)]
+    pairs = [(groups[a], groups[b]) for a in range(len(groups)) for b in range(a + 1)]
+    return [[(i, j) for i in high for j in low if j <= i] for high, low in pairs]
 
 
 # Contribution of a point to the normal equations: two rows of the weighted Jacobian, each with its
@@ -296,7 +279,17 @@ def _cost(values: list[Lanes]) -> Vector:
 
 
 def _still_cost(values: list[Lanes]) -> Vector:
-    return [still_cost(values)]
+    """Return :attr:`View.truncated` of a camera at rest, which takes less."""
+    point, ray, by_ray = values[0:3], values[3:5], [values[6:8], values[8:10]]
+    state = values[POINT_SIZE : POINT_SIZE + STATE_SIZE]
+    moved = multiply([state[0:3], state[3:6], state[6:9]], point)
+    rig_point = [a + b for a, b in zip(moved, state[9:12], strict=True)]
+    x, y, z = _seen(rig_point, _matrix(values[AXES:CENTRE]), values[CENTRE:POINT_SIZE])
+    inverse_depth = 1.0 / z
+    offset = [x * inverse_depth - ray[0], y * inverse_depth - ray[1]]
+    error = multiply(by_ray, offset)
+    squared, scale = dot(error, error), values[POINT_SIZE + STATE_SIZE]
+    return [values[WEIGHT] * select((z > 0.0) & (squared < scale), squared, scale)]
 
 
 def _rows(looks: int, values: list[Lanes]) -> Vector:

@@ -342,16 +342,6 @@ def decided(inverse: Array2, prior: PriorTerms, noise: float) -> float:
     return max(total, 0.0)
 
 
-@inlined
-def _least_eigenvalue(information: Array, inverse: Array) -> float:
-    """Return a bound below the least eigenvalue for a unit diagonal: one over the inverse's trace.
-
-    It is less by the number of parameters at most; 0 where there is no inverse.
-    """
-    total = np.sum(np.diag(inverse) * np.diag(information))
-    return 1.0 / total if total > 0.0 else 0.0
-
-
 @entry
 def best_motion(
     data: Out[Array2], count: int, start: Array1, prior: PriorTerms, threshold: float
@@ -384,7 +374,9 @@ def best_motion(
         noise = noise_deviation(errors, gate, freedom)
         gate = min(max(threshold, GATE * noise), WIDEST_GATE * threshold)
     inliers = errors < gate * gate
+    # The least eigenvalue for a unit diagonal is more than this, at most 18 times.
+    total = np.sum(np.diag(inverse) * np.diag(information))
     return Best(
         state, noise * noise * inverse, noise, 2.0 * np.sum(inliers) - freedom,
-        _least_eigenvalue(information, inverse), inliers, errors,
+        1.0 / total if total > 0.0 else 0.0, inliers, errors,
     )  # fmt: skip

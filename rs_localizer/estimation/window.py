@@ -54,6 +54,7 @@ from rs_localizer.core.state import (
     STATE_SIZE,
     STATE_TRANSLATION,
     TURN,
+    VELOCITIES,
     rotation_of,
     step_between,
 )
@@ -87,7 +88,7 @@ _SETTLED = 0.1
 _LEAST_SCALE, _MOST_SCALE = 0.03, 100.0
 # Accelerations of the last transitions may be so many times as large as they were learnt. In the
 # mean, the logarithm of the odds that they are not: at 30 Hz one start in two seconds.
-_GROWN, _ODDS, _RECENT = (1.0, 3.0, 10.0), math.log(20.0), 3
+_GROWN, _ODDS, _RECENT = (3.0, 10.0), math.log(20.0), 3
 # Deviations of velocities in images from the trajectory's, over configured accelerations times the
 # time between images, if that (s) is longer: below, they change no twist of hands nor of a phone.
 _SWINGS, _SLOW = (0.01, 0.03, 0.1, 0.3), 0.15
@@ -98,6 +99,8 @@ _UNSHAKEN = np.eye(PARAMETERS, PARAMETERS + 3 * len(MIDDLE_VALUES))
 _UNSHAKEN[TURN, PARAMETERS:] = -np.kron(MIDDLE_VALUES, np.eye(3))
 _UNSHAKEN[ANGULAR, PARAMETERS:] = -np.kron(MIDDLE_RATES, np.eye(3))
 _ORIGIN = np.zeros(3)
+# Which deviation the axes have.
+_AXES = (0, 1, 2, 3, 3, 3)
 # Powers of a time in velocities and accelerations, by the places of a step.
 _ORDERS = np.repeat([0.0, 0.0, 1.0, 1.0, 2.0, 2.0], 3)
 
@@ -134,13 +137,48 @@ class MotionSample(NamedTuple):
 
 
 class _Solved(NamedTuple):
-    """Motions of n samples, behind the start (n + 1 rows), or of the last of them."""
+    """Motions of n samples, behind the start."""
 
     states: Array  # (n+1,24)
     covariances: Array  # (n+1,18,18)
     deviations: Array  # (4,) as they were learnt
     surprise: float  # squared distance of the last sample from its prediction
-    evidences: Array  # (n+1,) logarithms, of all samples until each
+    evidence: float  # logarithm, of all samples
+
+
+class _Swinging(NamedTuple):
+    """What n images tell of a trajectory beside which their velocities are."""
+
+    states: Array  # (n,24)
+    own: tuple[Array, Array]  # informations (n,18,18) and gradients (n,18) of the images
+    told: tuple[Array, Array]  # of the trajectory
+    spreads: Array  # (n,18,18) covariance of the images' motions, if the trajectory is known
+    evidence: float  # logarithm of the factor of their likelihood
+
+    @classmethod
+    def of(cls, states: Array, own: tuple[Array, Array], deviations: Array) -> _Swinging:
+        """Let velocities differ by deviations (n,4)."""
+        informations, gradients = own
+        precisions, spreads = deviations[:, _AXES] ** -2.0, np.zeros_like(informations)
+        inner = informations[:, VELOCITIES, VELOCITIES] + precisions[:, :, None] * np.eye(6)
+        spreads[:, VELOCITIES, VELOCITIES] = np.linalg.inv(inner)
+        across = informations @ spreads
+        pulled = np.einsum("nij,nj->ni", across, gradients)
+        evidence = np.log(precisions).sum() - np.linalg.slogdet(inner)[1].sum()
+        evidence += np.einsum("ni,nij,nj->", gradients, spreads, gradients)
+        told = informations - across @ informations, gradients - pulled
+        return cls(states, own, told, spreads, 0.5 * float(evidence))
+
+    def of_images(self, found: _Solved) -> _Solved:
+        """Return the motions of the images by those of the trajectory."""
+        for k, (state, told, pull, spread) in enumerate(
+            zip(self.states, *self.own, self.spreads, strict=True), 1
+        ):
+            kept = np.eye(PARAMETERS) - spread @ told
+            step = kept @ step_between(state, found.states[k]) + spread @ pull
+            found.states[k] = apply_step(state, step)
+            found.covariances[k] = kept @ found.covariances[k] @ kept.T + spread
+        return found._replace(evidence=found.evidence + self.evidence)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,7 +198,7 @@ class MotionWindow:
     configured: Array
     deviations: Array
     samples: tuple[MotionSample, ...] = ()
-    solved: tuple[_Solved, ...] = ()  # filtered, by accelerations: as learnt, and larger ones
+    solved: tuple[_Solved, ...] = ()  # filtered; first with accelerations as they were learnt
     readout_share: float = 0.0
     mixed: dict[int, Gaussian] = field(default_factory=dict)  # by row, those that were asked for
 
@@ -196,26 +234,23 @@ class MotionWindow:
             return self.start
         last = len(self.samples)
         if last - frames not in self.mixed:
-            solved, rows = self.solved, range(last, last + 1)
-            if frames:  # which later ones tell of, too
-                solved, rows = self._by_samples(0, True), range(last)
-            for row in rows:
-                self.mixed[row] = self._mixed(solved, row)
+            # Of the last one no later sample tells.
+            rows = range(last) if frames else range(last, last + 1)
+            solved = self._solutions(0, True) if frames else self.solved
+            self.mixed.update({row: self._mixture(solved, row) for row in rows})
         return self.mixed[last - frames]
 
-    def _mixed(self, solved: Sequence[_Solved], row: int) -> Gaussian:
+    def _mixture(self, solved: Sequence[_Solved], row: int) -> Gaussian:
         odds = np.zeros(len(solved))
         odds[0] = _ODDS
         # From where the camera is: a map's origin may be thousands of kilometres away.
-        states = np.array([one.states[row - len(self)] for one in solved])
+        states = np.array([one.states[row] for one in solved])
         centre = -rotation_of(states[0]).T @ states[0, STATE_TRANSLATION]
         for state in states:
             state[STATE_TRANSLATION] += rotation_of(state) @ centre
-        parts = Gaussians(
-            states, np.zeros((len(odds), 0)),
-            np.array([one.covariances[row - len(self)] for one in solved]),
-            np.array([one.evidences[-1] for one in solved]),
-        )  # fmt: skip
+        covariances = np.array([one.covariances[row] for one in solved])
+        evidences = np.array([one.evidence for one in solved])
+        parts = Gaussians(states, np.zeros((len(odds), 0)), covariances, evidences)
         whole = mixture(parts, odds, TEMPER)
         whole.state[STATE_TRANSLATION] -= rotation_of(whole.state) @ centre
         return Gaussian(self.times[row], whole.state, whole.covariance)
@@ -236,11 +271,11 @@ class MotionWindow:
         last = self.newest
         if time_ns == last.time_ns:
             return last
-        state, covariance, _ = _predicted(
-            last.state, last.covariance, 1e-9 * (time_ns - last.time_ns), self.deviations,
-            self.readout_share, float(lasting),
+        state, transport, added = _predicted(
+            last.state, 1e-9 * (time_ns - last.time_ns), self.deviations, self.readout_share,
+            float(lasting),
         )  # fmt: skip
-        return Gaussian(time_ns, state, covariance)
+        return Gaussian(time_ns, state, transport @ last.covariance @ transport.T + added)
 
     def at(self, time_ns: int) -> Gaussian | None:
         """Return the motion at a time, given all frames; None before the first of them."""
@@ -269,47 +304,40 @@ class MotionWindow:
 
     def _through(self, rounds: int) -> MotionWindow:
         """Return the window with the motion by its samples, learning from them in some rounds."""
-        solved = self._by_samples(rounds, False)
+        solved = self._solutions(rounds, False)
         return replace(self, deviations=solved[0].deviations, solved=solved, mixed={})
 
-    def _by_samples(self, rounds: int, smooths: bool) -> tuple[_Solved, ...]:
-        """Return the motions by all samples or, not smoothed, by those until each.
-
-        The filter, which goes on, is that of the accelerations that were learnt: to where larger
-        ones begin, there is no other.
-        """
+    def _solutions(self, rounds: int, smooths: bool) -> tuple[_Solved, ...]:
+        """Return the motions by all samples or, not smoothed, by those until each."""
         _, states, informations, gradients = map(np.array, zip(*self.samples, strict=True))
         seconds: Array = np.diff(self.times).astype(np.float64) * 1e-9
-        scales: Array = np.stack([self.configured, self.deviations])
-        start, first, found = (self.start.state, self.start.covariance), 0, list[_Solved]()
-        swings = _SWINGS if np.median(seconds) > _SLOW else ()
-        for grown, swing in (*((grown, 0.0) for grown in _GROWN), *((1.0, x) for x in swings)):
-            if swing > 0.0:
-                first, start = 0, (self.start.state, self.start.covariance)
-            found.append(_Solved(*_solve(
-                seconds[first:], states[first:], informations[first:], gradients[first:], *start,
-                scales, self.readout_share, 0 if found else rounds, smooths, grown, swing,
-            )))  # fmt: skip
-            if len(found) == 1:
-                learnt, scales = found[0], np.stack([self.configured, found[0].deviations])
-                if not smooths:
-                    first = max(len(seconds) - _RECENT, 0)
-                    start = learnt.states[first], learnt.covariances[first]
-            else:
-                found[-1] = found[-1]._replace(
-                    evidences=found[-1].evidences + learnt.evidences[first]
-                )
+
+        def solved(
+            told: tuple[Array, Array], deviations: Array, rounds: int, grown: float
+        ) -> _Solved:
+            return _Solved(*_solve(
+                seconds, states, *told, self.start.state, self.start.covariance,
+                np.stack([self.configured, deviations]), self.readout_share, rounds, smooths, grown,
+            ))  # fmt: skip
+
+        told = informations, gradients
+        found = [solved(told, self.deviations, rounds, 1.0)]
+        learnt = found[0].deviations
+        found += [solved(told, learnt, 0, grown) for grown in _GROWN]
+        for swing in _SWINGS if np.median(seconds) > _SLOW else ():
+            swings = swing * np.outer(seconds, self.configured)
+            beside = _Swinging.of(states, told, swings)
+            found.append(beside.of_images(solved(beside.told, learnt, 0, 1.0)))
         return tuple(found)
 
 
 @entry
 def _predicted(
-    state: Array1, covariance: Array2, seconds: float, deviations: Array1, readout_share: float,
-    lasting: float,
-) -> tuple[Array, Array, Array]:  # fmt: skip
-    """State and covariance so much later, and the derivative of the state.
+    state: Array1, seconds: float, deviations: Array1, readout_share: float, lasting: float
+) -> tuple[Array, Array, Array]:
+    """Return the state so much later, its derivative, and the covariance that is added until then.
 
-    The covariance is that of accelerations that last so long (s).
+    The latter two are those of accelerations that last so long (s).
     """
     numbers = (
         state[:9].copy().reshape(3, 3), state[9:12].copy(), state[12:15].copy(),
@@ -321,12 +349,12 @@ def _predicted(
     ))  # fmt: skip
     if lasting != FADING:
         _, transport = carried(numbers, seconds, lasting)
-    spread = transport @ covariance @ transport.T + _added(seconds, deviations, lasting)
+    added = _added(seconds, deviations, lasting)
     for i in range(6):
         for j in range(6):
             moved = predicted[12 + i] * predicted[12 + j]
-            spread[i, j] += (readout_share * seconds) ** 2 * moved
-    return predicted, spread, transport
+            added[i, j] += (readout_share * seconds) ** 2 * moved
+    return predicted, transport, added
 
 
 @entry
@@ -386,8 +414,8 @@ def singer(seconds: float, fading: float) -> Array:
 def _solve(
     seconds: Array1, states: Array2, informations: Array3, gradients: Array2, start: Array1,
     start_covariance: Array2, scales: Array2, readout_share: float, rounds: int, smooths: bool,
-    grown: float, swing: float,
-) -> tuple[Array, Array, Array, float, Array]:  # fmt: skip
+    grown: float,
+) -> tuple[Array, Array, Array, float, float]:  # fmt: skip
     """Filter, learn deviations and perhaps smooth: the fields of :class:`_Solved`.
 
     Args:
@@ -396,27 +424,21 @@ def _solve(
         rounds: of learning.
         smooths: all samples tell of all motions.
         grown: factor of the deviations of the last transitions.
-        swing: deviation of velocities beside the trajectory's, over configured accelerations times
-            seconds; 0: none.
     """
     count, configured, deviations = len(seconds), scales[0], scales[1].copy()
     square, row = (count + 1, PARAMETERS, PARAMETERS), (count + 1, STATE_SIZE)
     predicted, filtered = np.empty(row), np.empty(row)
-    predictions, transports, knowns = np.empty(square), np.empty(square), np.empty(square)
-    covariances, evidences = np.empty(square), np.zeros(count + 1)
-    told, pulls, beside = informations, gradients, 0.0
-    if swing > 0.0:
-        informations, gradients = told.copy(), pulls.copy()
-        for k in range(count):
-            beside += _of_trajectory(informations[k], gradients[k], swing * seconds[k] * configured)
+    added, transports, knowns = np.empty(square), np.empty(square), np.empty(square)
+    covariances = np.empty(square)
     while True:
-        filtered[0], covariances[0], surprise, evidences[0] = start, start_covariance, 0.0, beside
+        filtered[0], covariances[0], surprise, evidence = start, start_covariance, 0.0, 0.0
         for k in range(count):
             own = enlarged(deviations, configured, grown if k >= count - _RECENT else 1.0)
-            predicted[k], predictions[k], transports[k] = _predicted(
-                filtered[k], covariances[k], seconds[k], own, readout_share, FADING
+            predicted[k], transports[k], added[k] = _predicted(
+                filtered[k], seconds[k], own, readout_share, FADING
             )
-            known, narrower = inverse_of(predictions[k])
+            spread = transports[k] @ covariances[k] @ transports[k].T + added[k]
+            known, narrower = inverse_of(spread)
             covariances[k + 1], left = inverse_of(informations[k] + known)
             right = gradients[k] + known @ step_between(states[k], predicted[k])
             step = covariances[k + 1] @ right
@@ -424,7 +446,7 @@ def _solve(
             moved = step_between(predicted[k], filtered[k + 1])
             surprise = np.sum(moved * (known @ moved))
             surprise += np.sum(step * (informations[k] @ step - 2.0 * gradients[k]))
-            evidences[k + 1] = evidences[k] - (narrower + left + 0.5 * surprise)
+            evidence -= narrower + left + 0.5 * surprise
         if rounds == 0 and not smooths:
             break
         scores, weight = np.zeros((4, 3)), 1.0
@@ -436,7 +458,8 @@ def _solve(
             weight *= _FORGETTING
             gain = covariances[k] @ transports[k].T @ known
             filtered[k] = apply_step(filtered[k], gain @ step)
-            whole = covariances[k] + gain @ (after - predictions[k]) @ gain.T
+            kept = np.eye(PARAMETERS) - gain @ transports[k]  # no difference of large ones (Joseph)
+            whole = kept @ covariances[k] @ kept.T + gain @ (after + added[k]) @ gain.T
             covariances[k] = 0.5 * (whole + whole.T)
         if rounds == 0:
             break
@@ -447,48 +470,7 @@ def _solve(
         deviations[:3] = np.maximum(deviations[:3], _LEAST_SHARE * deviations[:3].max())
         is_settled = np.max(np.abs(np.log(deviations / before))) < _SETTLED
         rounds = 0 if is_settled else rounds - 1
-    for k in range(count if swing > 0.0 else 0):
-        spread = _swinging(told[k], swing * seconds[k] * configured)
-        kept = np.eye(PARAMETERS) - spread @ told[k]
-        step = kept @ step_between(states[k], filtered[k + 1]) + spread @ pulls[k]
-        filtered[k + 1] = apply_step(states[k], step)
-        covariances[k + 1] = kept @ covariances[k + 1] @ kept.T + spread
-    return filtered, covariances, deviations, surprise, evidences
-
-
-@kernel
-def _swinging(information: Array2, deviations: Array1) -> Array:
-    """Return the covariance (18,18) of velocities beside a trajectory that is known.
-
-    Args:
-        information: (18,18) of an image.
-        deviations: (4,) of these velocities.
-    """
-    inner = np.ascontiguousarray(information[6:12, 6:12])
-    for axis in range(6):
-        inner[axis, axis] += deviations[min(axis, 3)] ** -2
-    spread = np.zeros((PARAMETERS, PARAMETERS))
-    spread[6:12, 6:12] = inverted(inner)
-    return spread
-
-
-@kernel
-def _of_trajectory(information: Array2, gradient: Array1, deviations: Array1) -> float:
-    """Turn what an image tells of its motion into what it tells of the trajectory.
-
-    Returns:
-        the logarithm of the factor of its likelihood.
-    """
-    spread, volume = _swinging(information, deviations), 0.0
-    inner = np.ascontiguousarray(spread[6:12, 6:12])
-    volume -= inverse_of(inner)[1]
-    for axis in range(6):
-        volume += math.log(deviations[min(axis, 3)])
-    volume -= 0.5 * np.sum(gradient * (spread @ gradient))
-    across = information @ spread
-    gradient -= across @ gradient
-    information -= across @ information
-    return -volume
+    return filtered, covariances, deviations, surprise, evidence
 
 
 @entry

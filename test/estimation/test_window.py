@@ -118,7 +118,7 @@ def dense(samples, deviations):
 @pytest.fixture
 def as_learnt(monkeypatch):
     """Let accelerations be as large as they were learnt, which the dense form has."""
-    monkeypatch.setattr(window_module, "_GROWN", (1.0,))
+    monkeypatch.setattr(window_module, "_GROWN", ())
 
 
 @pytest.mark.usefixtures("as_learnt")
@@ -188,6 +188,22 @@ def test_between_frames_it_passes_through_both_and_after_them_it_spreads():
              for ms in (0, 10, 30, 100)]  # fmt: skip
     assert np.all(np.diff(grown) > 0.0)
     assert window.at(window.start.time_ns - 1) is None
+
+
+@pytest.mark.parametrize("seconds", [PERIOD, 10 * PERIOD])
+def test_between_two_frames_of_a_fast_camera_a_covariance_is_positive(seconds):
+    """Velocities are uncertain by 60 m/s, places by 10 um: nothing may be a difference of both."""
+    seen = np.repeat([1e-6, 1e-5, 0.1, 1.0], 3)
+    before = np.diag(np.concatenate([seen[:6], np.repeat([0.05, 60.0, 1.0, 0.5], 3)]) ** 2)
+    window = MotionWindow.begin(Gaussian(0, STILL, before), Acceleration(1.0, 0.5))
+    sample = samples_of(np.zeros((1, 18)), np.random.default_rng(1))[0]._replace(
+        time_ns=round(1e9 * seconds), information=np.diag(np.append(seen**-2.0, np.zeros(6)))
+    )
+    window = window.joined(sample)
+    for share in (0.1, 0.3, 0.5, 0.7, 0.9):
+        between = window.at(round(share * sample.time_ns)).covariance
+        scale = np.sqrt(between.diagonal())
+        assert np.linalg.eigvalsh(between / np.outer(scale, scale))[0] > 0.0
 
 
 def estimate(step, joint):
