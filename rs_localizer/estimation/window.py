@@ -147,7 +147,7 @@ class _Solved(NamedTuple):
 
 
 class _Swinging(NamedTuple):
-    """What n images tell of a trajectory beside which their velocities are."""
+    """Motions of n images about one trajectory, beside which their velocities are."""
 
     states: Array  # (n,24)
     own: tuple[Array, Array]  # informations (n,18,18) and gradients (n,18) of the images
@@ -337,7 +337,7 @@ def _predicted(
 ) -> tuple[Array, Array, Array]:
     """Return the state so much later, its derivative, and the covariance that is added until then.
 
-    The latter two are those of accelerations that last so long (s).
+    Derivative and covariance are those of accelerations that last so long (s).
     """
     numbers = (
         state[:9].copy().reshape(3, 3), state[9:12].copy(), state[12:15].copy(),
