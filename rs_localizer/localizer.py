@@ -39,7 +39,7 @@ from rs_localizer.estimation.calibration import (
 )
 from rs_localizer.estimation.hypotheses import Posterior, frame_posterior
 from rs_localizer.estimation.known_rotation import coupled_turn
-from rs_localizer.estimation.left_out import LeftOut, by_chance, left_out
+from rs_localizer.estimation.left_out import LeftOut, by_chance, left_out, reordered
 from rs_localizer.estimation.moved_part import MovedParts, look_at, neighbours_alike
 from rs_localizer.estimation.points import (
     NEAREST,
@@ -499,7 +499,8 @@ class Localizer:
             rolling=rolling,
         )  # fmt: skip
         if failure is not None:
-            return failure
+            others = rolling and not tracked and reordered(self._search, observed, gate)
+            return others or failure
         odd = LeftOut()
         if rolling:  # a global shutter leaves out rows of one that moves
             odd = left_out(self._search, observed, posterior, gate, known=tracked)

@@ -82,13 +82,13 @@ _BENT, _BENT_OFF_CENTRE = 10.0, 1.0
 # probable where K is off by 0.048: the principal point of a phone is by 0.012, and of a lens of
 # which a third is missing by 0.03 (paired set).
 _USUAL = 0.01
-ORDERS = [
+# The other orders in which the four corners of a marker may be given.
+_ORDERS = [
     tuple((first + step * k) % 4 for k in range(4))
     for step in (1, -1)
     for first in range(4)
     if (first, step) != (0, 1)
 ]
-"""The other orders in which the four corners of a marker may be given."""
 _CORNERS = ("upper left", "upper right", "lower right", "lower left")
 # Four points in a row are a marker's corners if they are out of a parallelogram by less than this
 # share of a side; of them another order explains so many, where ours does less than a half.
@@ -137,7 +137,7 @@ def left_out(
     if failure is not None:
         return LeftOut(failure, _rough(observed, posterior) if wide else "")
     if not known and 2 * found < len(inliers):
-        failure = _reordered(search, observed, WIDEST_GATE * threshold)
+        failure = reordered(search, observed, threshold)
         if failure is not None:
             return LeftOut(failure)
     # A principal point alone may point to another image.
@@ -199,17 +199,25 @@ def _cameras_apart(observed: Observed, inliers: BoolArray, second: _Group, thres
     )
 
 
-def _reordered(search: MotionSearch, observed: Observed, gate: float) -> Failure | None:
-    """Return the failure of a frame of markers that fit if their corners come in another order."""
+def reordered(search: MotionSearch, observed: Observed, threshold: float) -> Failure | None:
+    """Return the failure of a frame of markers that fit if their corners come in another order.
+
+    ``threshold`` is that of inliers, px.
+    """
     seen, usable = observed.observations, observed.usable.indices
-    for order in ORDERS if _markers(observed) else ():
+    for order in _ORDERS if _markers(observed) else ():
         by = np.arange(len(usable)).reshape(-1, 4)[:, order].ravel()
         part = replace(observed, ranking=observed.ranking[:0], observations=Observations.of(
             seen.points, seen.rays[by], seen.tau[by], seen.by_ray[by], seen.mounts, seen.camera[by]
         ))  # fmt: skip
-        fit = search.from_rough(part, search.rough(part))
+        fit, gate = search.from_rough(part, search.rough(part)), WIDEST_GATE * threshold
         if fit.found and np.mean(part.observations.within(fit.state, gate)) > _FIT:
-            return Failure(Reason.CALIBRATION, f"the points fit if {in_order(order)}")
+            names = ", ".join(_CORNERS[order.index(k)] for k in range(4))
+            return Failure(
+                Reason.CALIBRATION,
+                "the points fit if corners of markers come in another order: where "
+                f"{', '.join(_CORNERS)} belong, {names} stand",
+            )
     return None
 
 
@@ -222,15 +230,6 @@ def _markers(observed: Observed) -> int:
     skew = np.linalg.norm(np.einsum("mki,k->mi", corners, _ROUND), axis=1)
     flat = skew < _FLAT * np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
     return len(corners) if flat.all() else 0
-
-
-def in_order(order: tuple[int, ...]) -> str:
-    """Say in which order corners of markers come that fit in this one."""
-    names = ", ".join(_CORNERS[order.index(k)] for k in range(4))
-    return (
-        f"corners of markers come in another order: where {', '.join(_CORNERS)} belong, {names} "
-        "stand"
-    )
 
 
 def _rough(observed: Observed, posterior: Posterior) -> str:
@@ -304,11 +303,10 @@ def _of_another_lens(
         return None
     first = _Group(posterior.inliers, posterior.state, posterior.squared_errors)
     parts = [(first,)] if second is None else [(first,), (first, second)]
-    evidence = max(
-        _evidence_without_a_marker(observed, posterior, threshold),
-        *(_evidence(groups, PARAMETERS * len(groups), count, area) for groups in parts),
-    )
-    if explained < evidence + max(0.0 if resized else _EACH * count, _LEAST_CHANCE):
+    evidence = max(_evidence(groups, PARAMETERS * len(groups), count, area) for groups in parts)
+    margin = max(0.0 if resized else _EACH * count, _LEAST_CHANCE)
+    moved = _evidence_without_a_marker(observed, posterior, threshold) + _LEAST_CHANCE
+    if explained < max(evidence + margin, moved):
         return None
     fitting = np.count_nonzero(first.chosen)
     more = np.count_nonzero(group.chosen) - fitting

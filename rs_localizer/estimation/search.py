@@ -428,7 +428,11 @@ class MotionSearch:
         return other if other.cost < found.cost else found
 
     def optimize(
-        self, observed: Observed, state: Array, first_scale: float, terms: PriorTerms,
+        self,
+        observed: Observed,
+        state: Array,
+        first_scale: float,
+        terms: PriorTerms,
         last_scale: float | None = None,
     ) -> Candidate:  # fmt: skip
         """Optimize one state locally, down to the inlier threshold."""

@@ -213,9 +213,7 @@ class CameraFrames(FrameLocalizer):
             )
         return self._mistakes.explained(
             published,
-            lambda: what_fits.what_fits(
-                tracker.localizer, cloud.points, cloud.pixels, what_fits.ids_of(cloud)
-            ),
+            lambda: what_fits.what_fits(tracker.localizer, cloud.points, cloud.pixels),
         )
 
     def _alone(self, cloud: Correspondences, result: Estimate) -> Estimate | Failure:

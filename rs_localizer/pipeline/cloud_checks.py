@@ -16,7 +16,6 @@ from rs_localizer.core.reasons import Notice
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.moved_part import MovedPart
 from rs_localizer.io.clouds import Correspondences
-from rs_localizer.pipeline.what_fits import ids_of
 
 # Coordinates in single precision shall tell millimetres, in m: they do as far as 8 km.
 _FINE = 0.00097
@@ -109,6 +108,11 @@ def stale_landmarks(
     return said
 
 
+def _ids_of(cloud: Correspondences) -> IntArray | None:
+    """Return the ids of a cloud's points, if it has any."""
+    return cloud.table["id"].astype(np.int64) if "id" in (cloud.table.dtype.names or ()) else None
+
+
 class _Markers(NamedTuple):
     """The markers of a cloud: squares of which four ids in a row are the corners."""
 
@@ -118,7 +122,7 @@ class _Markers(NamedTuple):
 
     @classmethod
     def of(cls, cloud: Correspondences, names: Sequence[str]) -> _Markers:
-        own = ids_of(cloud)
+        own = _ids_of(cloud)
         ids, rows = np.unique(np.zeros(0, np.int64) if own is None else own, return_index=True)
         first = np.flatnonzero((ids[:-3] % 4 == 0) & (ids[3:] == ids[:-3] + 3))
         rows = rows[first[:, None] + np.arange(4)]
@@ -187,7 +191,7 @@ def moved_landmarks(
 
 def _names(cloud: Correspondences, some: BoolArray, names: Sequence[str]) -> tuple[int, str]:
     """Return how many landmarks some points are, and the first of their names."""
-    rows, ids = np.flatnonzero(some), ids_of(cloud)
+    rows, ids = np.flatnonzero(some), _ids_of(cloud)
     if ids is None:
         points = np.unique(cloud.points[rows], axis=0)
         own = [f"({x:.2f}, {y:.2f}, {z:.2f})" for x, y, z in points]

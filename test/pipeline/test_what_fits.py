@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Frames refused for how their sender counts pixels or corners: what would fit is named.
+"""Frames refused for how their sender counts pixels: what would fit is named.
 
 Pixels are the independent projector's, each at the time of its row.
 """
@@ -54,18 +54,10 @@ def seen(points, t, noise=0.3):
     return pixels + noise * np.random.default_rng(round(1e3 * t)).normal(size=pixels.shape)
 
 
-def opposite(pixels):
-    return pixels.reshape(-1, 4, 2)[:, [2, 3, 0, 1]].reshape(-1, 2)
-
-
 MISTAKES = {
     "mirrored, left to right or top to bottom": lambda pixels: pixels * [-1.0, 1.0] + [639.0, 0.0],
     "mirrored, left to right or top": lambda pixels: pixels * [1.0, -1.0] + [0.0, 479.0],
     "exchanged": lambda pixels: pixels[:, ::-1],
-    "lower right, lower left, upper left, upper right stand": opposite,
-    "upper right, upper left, lower left, lower right stand": lambda pixels: pixels.reshape(
-        -1, 4, 2
-    )[:, [1, 0, 3, 2]].reshape(-1, 2),
 }
 
 
@@ -74,27 +66,28 @@ MIRROR = MISTAKES["mirrored, left to right or top to bottom"]
 
 @pytest.mark.parametrize("name", MISTAKES)
 def test_each_mistake_is_named_and_no_other(name):
-    points, ids = corners(), np.arange(40)
+    points = corners()
     pixels = MISTAKES[name](seen(points, 0.2))
     for camera in (CAMERA, camera_of(TRUE, readout_time=0.0)):
         localizer = Localizer(camera)
         assert not localizer.localize(points, pixels)
-        said = what_fits(localizer, points, pixels, ids)
+        said = what_fits(localizer, points, pixels)
         assert name in said
         assert not any(other in said for other in MISTAKES if not other.startswith(name[:8]))
 
 
 def test_what_is_right_or_otherwise_wrong_has_no_name():
     points, localizer, rng = corners(), Localizer(CAMERA), np.random.default_rng(0)
-    pixels, ids = seen(points, 0.1), np.arange(40)
+    pixels = seen(points, 0.1)
     assert localizer.localize(points, pixels)
     for wrong in (
         rng.uniform([0, 0], [639, 479], (40, 2)),  # chance
         rng.permutation(pixels),  # other landmarks
-        0.6 * (pixels - K[:2, 2]) + K[:2, 2] + rng.normal(0.0, 12.0, (40, 2)),  # another lens
     ):
         assert not localizer.localize(points, wrong)
-        assert what_fits(localizer, points, wrong, ids) == ""
+        assert what_fits(localizer, points, wrong) == ""
+    another_lens = 0.6 * (pixels - K[:2, 2]) + K[:2, 2] + rng.normal(0.0, 12.0, (40, 2))
+    assert what_fits(localizer, points, another_lens) == ""
     # A plane that is mirrored is one that is seen from behind.
     wall_alone = points[:, 2] == 3.6
     flat, mirrored = points[wall_alone], MIRROR(pixels[wall_alone])
@@ -102,9 +95,7 @@ def test_what_is_right_or_otherwise_wrong_has_no_name():
     assert (
         what_fits(localizer, flat, mirrored) == what_fits(localizer, flat, pixels[wall_alone]) == ""
     )
-    assert [what_fits(localizer, points[:n], pixels[:n], ids[:n]) for n in range(5)] == [""] * 5
-    # Ids of landmarks are no corners.
-    assert what_fits(localizer, points, opposite(pixels), 7 * ids) == ""
+    assert [what_fits(localizer, points[:n], pixels[:n]) for n in range(5)] == [""] * 5
 
 
 def test_a_day_of_refusals_costs_ten_tries():
