@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -95,8 +96,7 @@ def spectrum_of(times_ns: IntArray, rates: Array, noise: float) -> Spectrum:
     length = min(max(round(_ALIKE / period), _FEWEST), _MOST, len(rates))
     starts = np.arange(len(rates) - length, -1, -max(length // 2, 1))
     pieces = rates[starts[:, None] + np.arange(length)]
-    line = np.linalg.qr(np.vander(np.arange(length) - 0.5 * length, 2))[0]
-    taper = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
+    line, taper = _piece(length)
     lines = line.T @ pieces
     pieces = (pieces - line @ lines) * taper[:, None]
     shown = np.abs(np.fft.rfft(pieces, 2 * length, axis=1)) ** 2
@@ -104,8 +104,8 @@ def spectrum_of(times_ns: IntArray, rates: Array, noise: float) -> Spectrum:
     # Deviations over means: of a frequency, and of a band.
     doubt = 1.0 / math.sqrt(3 * len(pieces))
     band, square = max(length // _BANDS, 1), float(np.mean(rates**2))
-    parts = np.convolve(power[_SLOW:], np.full(band, 1.0 / band), "valid")
-    least = parts.min(initial=0.0 if len(parts) == 0 else math.inf)
+    quick = power[min(_SLOW, length // 2) :]
+    least = float(np.convolve(quick, np.full(band, 1.0 / band), "valid").min())
     least *= 1.0 + _BELOW * doubt / math.sqrt(max(_INDEPENDENT * band, 1.0))
     variance = max(noise**2 / period, least, _LEAST * (1.0 + square))
     beside = power - variance
@@ -116,6 +116,13 @@ def spectrum_of(times_ns: IntArray, rates: Array, noise: float) -> Spectrum:
     slope *= _STEEPER * 12.0 / (length**3 * period**2)
     constant = _VAGUE * (square + variance)
     return Spectrum(2.0 * np.pi * cycles, own, variance, constant, slope)
+
+
+@cache
+def _piece(length: int) -> tuple[Array, Array]:
+    """Return a slope and a constant (n,2), orthonormal, and a taper (n,) of so many readings."""
+    line = np.linalg.qr(np.vander(np.arange(length) - 0.5 * length, 2))[0]
+    return line, np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
 
 
 def smoothed(

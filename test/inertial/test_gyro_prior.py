@@ -170,3 +170,17 @@ def test_readings_tell_their_noise_and_how_well_they_tell_rates(rate):
         mean, covariance = smoothed(times[near], rates[near], wanted, wanted, spectrum)
         squared.append((mean - true(wanted)) ** 2 / covariance.diagonal()[:, None])
     assert 0.5 < np.mean(squared) < 1.5
+
+
+@pytest.mark.parametrize("count", [2, 3, 7, 17])
+def test_few_readings_have_the_noise_that_is_given(count):
+    times_ns, rates = (
+        2_500_000 * np.arange(count),
+        np.linspace(0.1, 0.2, count)[:, None] * np.ones(3),
+    )
+    spectrum = spectrum_of(times_ns, rates, 1e-3)
+    assert spectrum.noise == pytest.approx(400.0 * 1e-6)
+    times = 1e-9 * times_ns
+    mean, covariance = smoothed(times, rates, times, times, spectrum)
+    np.testing.assert_allclose(mean, rates, atol=0.05)
+    assert np.linalg.eigvalsh(covariance).min() > -1e-9
