@@ -11,6 +11,7 @@ from benchmarks.independent.cameras import Camera
 from rs_localizer.core.rotation_prior import ROTATION
 from rs_localizer.core.shake import COMBINATIONS, MIDDLE_RATES, MIDDLE_VALUES, shake_functions
 from rs_localizer.core.so3 import log
+from rs_localizer.inertial import turning
 from rs_localizer.inertial.gyro_prior import GyroscopeTrack
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.status import InertialSettings
@@ -128,6 +129,18 @@ def test_derivatives_by_what_the_gyroscope_is_off_by(far, since):
         by = np.subtract(*(log(turn[0] @ turn[1].T) for turn in turns)) / (2.0 * step)
         whole = _turned_by(found.by_errors[3:, k])
         np.testing.assert_allclose(whole, by, atol=3e-3 + 0.02 * abs(by).max(), err_msg=str(k))
+
+
+def test_a_frame_long_ago_makes_no_rotation_within_this_one_slow(monkeypatch):
+    """Smoothed by all 4,000 readings of a second, a frame took 3 s."""
+    solved, usual = [], turning.smoothed
+    monkeypatch.setattr(turning, "smoothed", lambda *of: solved.append(len(of[0])) or usual(*of))
+    shaken = Shaken(vibration=0.02)
+    found = read(shaken.samples(reach=1.1), MIDDLE_NS, READOUT_TIME, errors(), MIDDLE_NS - 10**9)
+    assert max(solved) < 200
+    then, now = shaken.pose(np.array([-1.0, 0.0]))[0]
+    expected = (now.inv() * then).as_matrix()
+    assert np.degrees(np.linalg.norm(log(np.ascontiguousarray(found.between @ expected.T)))) < 0.01
 
 
 def test_a_vibration_of_unknown_phase_is_no_rotation_that_is_known():
