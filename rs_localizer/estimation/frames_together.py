@@ -20,7 +20,6 @@ import math
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
-from functools import partial
 from itertools import compress
 from typing import NamedTuple
 
@@ -58,11 +57,9 @@ _MOST = 60
 # Threes that are kept: those that tell most of the focal length (its logarithm). It is known if its
 # deviation is less than the second.
 _KEPT, _KNOWN = 8, 0.02
-# Rounds of Gauss and Newton for each new three, the last of which moves no pose and no number by
-# more than this (with 4e-3 wrong lenses are told late). Each linearizes one three anew: that of
-# which poses, or shared numbers in units of the last, have moved most.
-_ROUNDS, _LEAST_STEP, _NEAR = 8, 1e-3, (0.3, 0.05, 0.02)
-_EXACT_ROUNDS = 5  # of all threes, three of which are enough before ceilings
+# Rounds of Gauss and Newton at most, the last of which moves no number by more than this part of
+# its deviation. Short of that, a focal length seems to be known where it is not.
+_ROUNDS, _NEAR = 20, 0.1
 _LEAST_NOISE = 0.1  # px, no real error is smaller
 _OF_MEDIAN = 1.386  # median of the squared errors of a point, over the variance of a coordinate
 # Focal lengths from which the search also starts, over K's.
@@ -259,13 +256,6 @@ class _Three:
         residuals = np.concatenate([each.found.residuals[each.found.inliers] for each in posed])
         self.variance = _variance(residuals**2)  # px^2, that each frame leaves alone
         self.equations: _Equations | None = None
-
-    def staleness(self, numbers: Array) -> float:
-        """Return how far shared numbers (11,) and poses are from where the linear terms hold."""
-        there = self.equations
-        assert there is not None
-        shared = np.abs((numbers - there.numbers)[:3]) / _NEAR
-        return float(max(shared.max(), np.abs(there.step[:_STAMP]).max() / _LEAST_STEP))
 
     def linearize(self, numbers: Array, principal: Array, least: float) -> None:
         """Linearize at these shared numbers (11,), where its own ones move to.
@@ -601,23 +591,21 @@ class FramesTogether:
         return float(_LEAST_NOISE**2 + of_map**2)
 
     def _fitted(
-        self, threes: Sequence[_Three], start: Array, principal: Array, exactly: Array | None = None
+        self, threes: Sequence[_Three], start: Array, principal: Array, known: Array | None = None
     ) -> _Fit:
         """Return the fit of all threes, which move there.
 
-        ``exactly`` (11,): information that counts instead of what is known before any frame; all
-        threes are linearized anew in each round, so that costs can be compared.
+        ``known`` (11,): information that counts instead of what is known before any frame.
         """
         numbers, least = start, self._least_variance(threes)
-        known = self._known if exactly is None else exactly
+        known = self._known if known is None else known
         covariance: Array = np.diag(1.0 / known)
-        new = [three for three in threes if three.equations is None]
-        for three in new:
-            three.linearize(numbers, principal, least)
-        for _ in range(_ROUNDS * len(new) if exactly is None else _EXACT_ROUNDS):
+        for _ in range(_ROUNDS):
+            for three in threes:
+                three.linearize(numbers, principal, least)
             information, slope = _summed(threes, known, numbers)
             try:
-                covariance[:] = np.linalg.inv(information + np.diag(self._known - known))
+                covariance = np.linalg.inv(information + np.diag(self._known - known))
                 step = -np.linalg.solve(information + _DAMPING, slope)
             except np.linalg.LinAlgError:
                 break
@@ -625,14 +613,7 @@ class FramesTogether:
             if not math.isfinite(farthest):
                 break
             numbers = numbers + step * min(1.0, _MOST_STEP / farthest)
-            if exactly is not None:
-                for three in threes:
-                    three.linearize(numbers, principal, least)
-                continue
-            stalest = max(threes, key=partial(_Three.staleness, numbers=numbers))
-            if stalest.staleness(numbers) > 1.0:
-                stalest.linearize(numbers, principal, least)
-            elif farthest < _LEAST_STEP:
+            if np.all(np.abs(step) < _NEAR * np.sqrt(np.diag(covariance))):
                 break
         linear = [three.equations for three in threes if three.equations]
         squared = np.concatenate([there.squared_errors for there in linear])
