@@ -30,7 +30,7 @@ from rs_localizer.config import LocalizerConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, Array1, Array2, Array3, IntArray1
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.lens import centre_of
+from rs_localizer.core.lens import centre_of, off_centre
 from rs_localizer.core.rig import Exposure, Mounts, Rig
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import (
@@ -62,6 +62,8 @@ _KEPT, _KNOWN = 8, 0.02
 _ROUNDS, _NEAR = 20, 0.1
 _LEAST_NOISE = 0.1  # px, no real error is smaller
 _OF_MEDIAN = 1.386  # median of the squared errors of a point, over the variance of a coordinate
+# Of other images, widths over that of K's.
+_SIZES = (0.25, 4.0)
 # Focal lengths from which the search also starts, over K's.
 _LENGTHS = (0.6, 1.7)
 # The largest step of a number: beyond it the linear terms no longer hold; usual steps of the first
@@ -444,8 +446,13 @@ class FramesTogether:
         given = config.calibration
         self._exposure, self._map_deviation = exposure, config.map_deviation
         self._most_variance = config.inlier_threshold**2
-        self._of_lens = given.principal_point, given.principal_point, given.distortion
-        centre = math.hypot(_USUAL * exposure.cameras[0].focal_length, given.principal_point)
+        (camera,) = exposure.cameras
+        # A K of another image has its principal point where no lens of this one has it.
+        self._is_doubtful = off_centre(camera)
+        away = 0.5 * np.array(camera.size) - centre_of(camera) if self._is_doubtful else np.zeros(2)
+        own = np.hypot(away, given.principal_point)
+        self._of_lens = np.append(own, given.distortion)
+        centre = math.hypot(_USUAL * camera.focal_length, given.principal_point)
         usual = math.hypot(_USUAL, given.focal_length), max(given.aspect_ratio, _EXACT)
         self._usual = np.array([*usual, centre, centre])
         self._threes: list[_Three] = []
@@ -462,6 +469,11 @@ class FramesTogether:
         if frames doubt K."""
         self.other: tuple[Camera, Array] | None = None
         """The camera that frames then tell, and deviations (4,) of these numbers of it."""
+        if self._is_doubtful:
+            larger = np.log(0.5 * np.array(camera.size) / np.maximum(centre_of(camera), 1.0))
+            numbers = np.r_[np.clip(larger.mean(), *np.log(_SIZES)), 0.0, away]
+            self.doubt = np.r_[_ANY[_LENGTH], 0.0, own]
+            self.other = self._another(*numbers), self.doubt
 
     @property
     def is_enough(self) -> bool:
@@ -499,9 +511,10 @@ class FramesTogether:
         found = Matrix(math.exp(length), math.exp(aspect), centre[0], centre[1])
         self.matrix = found if told.any() else None
         doubtful = self._beyond(fit, _DOUBTFULLY) > 0.0
-        numbers, deviations = (doubtful * each[_OF_K] for each in (fit.numbers, fit.deviations))
+        allowed = doubtful | self._is_doubtful
+        numbers, deviations = doubtful * fit.numbers[_OF_K], allowed * fit.deviations[_OF_K]
         self.doubt = np.hypot(numbers, deviations)
-        self.other = (self._another(*numbers), deviations) if doubtful.any() else None
+        self.other = (self._another(*numbers), deviations) if allowed.any() else None
         sizes, deviations = fit.numbers[_STRETCHED], fit.deviations[_STRETCHED]
         by_more = np.sqrt(np.maximum(sizes**2 - deviations**2, 0.0))
         # Frames that do not tell the readout time are not of the motion between them, or at rest.
