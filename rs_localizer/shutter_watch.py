@@ -243,9 +243,10 @@ class ShutterWatch:
         if self._camera is None:
             return found
         own = np.r_[found.angular_velocity, found.linear_velocity]
-        if self.error or self._turned:
+        turned = self._turned(float(np.linalg.norm(found.angular_velocity)))
+        if self.error or turned:
             calibration = found.calibration_covariance.copy()
-            calibration[TURN, TURN] += (_SWAY * self._turned) ** 2 * np.eye(3)
+            calibration[TURN, TURN] += (_SWAY * turned) ** 2 * np.eye(3)
             longer = self.error / self._usual * own
             calibration[VELOCITIES, VELOCITIES] += np.outer(longer, longer)
             found = replace(found, calibration_covariance=calibration)
@@ -378,13 +379,22 @@ class ShutterWatch:
         speeds, changes = np.maximum(self._speeds, 0.0)
         return float(changes / (6.0 * speeds)) if speeds else 0.0
 
-    @property
-    def _turned(self) -> float:
-        """Rate (rad/s, rms) at which images may be turned as wholes."""
-        longer = self._mean[0] - self._usual > _LONGER * math.sqrt(self._covariance[0, 0])
-        most = self._rotations.most if longer and not self.kind else 0.0
-        rate = self._rotations.rate if self._rotations.is_likely else most
-        return 0.0 if self._across else rate / self._usual
+    def _turned(self, rate: float = 0.0) -> float:
+        """Return the rate (rad/s, rms) at which images may be turned as wholes.
+
+        ``rate``: rad per readout, of the camera. Before frames are enough, what looks like a longer
+        readout time, or like rotations beside those between images, may be a stabilizer.
+        """
+        rotations, more = self._rotations, float(self._mean[0]) - self._usual
+        longer = more > _LONGER * math.sqrt(self._covariance[0, 0])
+        if rotations.is_likely:
+            turned = rotations.rate
+        elif rotations.are_enough:
+            turned = longer * rotations.most
+        else:
+            turned = max(rotations.most, longer * more / self._usual * rate)
+        doubtful = rotations.is_likely or not self.kind
+        return turned / self._usual if doubtful and not self._across else 0.0
 
     def _along(self, axis: int) -> MeasuredReadout:
         """Return the readout time along an axis, if the shutter moves along it."""
@@ -412,7 +422,7 @@ class ShutterWatch:
         if self._rotations.is_certain:
             self.kind, self.error = "stabilized", 0.0
             self.fault = (
-                f"rows show rotations that differ by {math.degrees(self._turned):.0f} deg/s (rms) "
+                f"rows show rotations that differ by {math.degrees(self._turned()):.0f} deg/s (rms) "
                 "from those between images, which no shutter does: is the film stabilized? Poses "
                 "are those of the picture that it shows; switch stabilization off"
             )
