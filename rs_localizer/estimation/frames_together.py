@@ -58,8 +58,9 @@ _MOST = 60
 # deviation is less than the second.
 _KEPT, _KNOWN = 8, 0.02
 # Rounds of Gauss and Newton at most, the last of which moves no number by more than this part of
-# its deviation. Short of that, a focal length seems to be known where it is not.
-_ROUNDS, _NEAR = 20, 0.1
+# its deviation, and no pose by more than this. Short of that, a focal length seems to be known
+# where it is not.
+_ROUNDS, _NEAR, _LEAST_STEP = 20, 0.1, 1e-3
 _LEAST_NOISE = 0.1  # px, no real error is smaller
 _OF_MEDIAN = 1.386  # median of the squared errors of a point, over the variance of a coordinate
 # Of other images, widths over that of K's.
@@ -566,7 +567,6 @@ class FramesTogether:
         known[_OF_K], start[_OF_K] = np.maximum(known[_OF_K], self._usual**-2.0), 0.0
         given = [_Three(self._exposure, three.posed, self._map, 0.0) for three in threes]
         with_k = self._fitted(given, start, np.zeros(2), known)
-        fit = self._fitted(threes, fit.numbers, principal, self._known)
         variance = max(fit.variance, self._least_variance(threes))
         worse = with_k.cost(variance) - fit.cost(variance)
         if worse > (_DOUBTFULLY * fit.wider) ** 2:
@@ -626,9 +626,11 @@ class FramesTogether:
             if not math.isfinite(farthest):
                 break
             numbers = numbers + step * min(1.0, _MOST_STEP / farthest)
-            if np.all(np.abs(step) < _NEAR * np.sqrt(np.diag(covariance))):
+            poses = max(np.abs(there.step[:_STAMP]).max() for there in _linear(threes))
+            near = np.abs(step) < _NEAR * np.sqrt(np.diag(covariance))
+            if near.all() and poses < _LEAST_STEP:
                 break
-        linear = [three.equations for three in threes if three.equations]
+        linear = _linear(threes)
         squared = np.concatenate([there.squared_errors for there in linear])
         wider = _ALIKE * _disagreement(linear, numbers)
         unlikely = known @ numbers**2 + sum(three.known @ three.own**2 for three in threes)
@@ -745,11 +747,15 @@ class CamerasTogether:
         return texts
 
 
+def _linear(threes: Sequence[_Three]) -> list[_Equations]:
+    return [three.equations for three in threes if three.equations]
+
+
 def _summed(threes: Sequence[_Three], known: Array, numbers: Array) -> tuple[Array, Array]:
     """Return information (11,11) and slope (11,) of all threes and what is known, there."""
     information: Array = np.diag(known)
     slope = known * numbers
-    for there in (three.equations for three in threes if three.equations):
+    for there in _linear(threes):
         information = information + there.information
         slope = slope + there.slope + there.information @ (numbers - there.numbers)
     return information, slope
