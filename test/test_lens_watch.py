@@ -148,7 +148,7 @@ def test_a_map_that_is_longer_one_way_moves_as_frames_tell(angle, surely):
     # One half of it is a stretch that frames show, the other half that all is larger. Along the
     # columns fy over fx may have half of it.
     off = stretch.at(board + longer).sum(axis=2) - longer
-    assert np.linalg.norm(off) < (0.3 if surely else 0.6) * np.linalg.norm(longer)
+    assert np.linalg.norm(off) < (0.35 if surely else 0.6) * np.linalg.norm(longer)
     found = re.search(r"longer by (\S+) % along \((\S+), (\S+), (\S+)\)", tracker.lens.fault)
     assert (found is not None) == surely
     if found is not None:
