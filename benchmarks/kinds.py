@@ -175,6 +175,15 @@ def other_lens(share: float, seen: Seen, rng: np.random.Generator) -> Seen:
     return seen._replace(K=K)
 
 
+def other_mode(
+    share: float, centre: tuple[float, float], seen: Seen, rng: np.random.Generator
+) -> Seen:
+    """K is that of a mode that shows another part of the sensor, in other pixels."""
+    K = np.diag([share * seen.K[0, 0], share * seen.K[1, 1], 1.0])
+    K[:2, 2] = centre
+    return seen._replace(K=K)
+
+
 def rectified(share: float, seen: Seen, rng: np.random.Generator) -> Seen:
     """The images have lost a part of the distortion, the lens that is told has it all."""
     straight = seen.bearings * np.diag(seen.K)[:2] + seen.K[:2, 2]
@@ -232,6 +241,11 @@ def kinds() -> list[Kind]:
         Kind("K of twice the size, wall", _wall, partial(other_resolution, 2.0)),
         Kind("K of 1.5 times the size, wall", _wall, partial(other_resolution, 1.5)),
         Kind("K of half the size, single", _wall, partial(other_resolution, 0.5), False),
+        *(Kind(f"K of {size}, {name}", scene, partial(other_mode, share, centre), motion=motion)
+          for size, share, centre in (("1280 x 720", 1.5, (640.0, 360.0)),
+                                      ("640 x 640", 1.0, (320.0, 320.0)))
+          for name, scene, motion in (("wall", _wall, hand), ("board", _board, hand),
+                                      ("facing board", _facing, _CALM))),
         Kind("f of 1.9 times, board", _board, partial(other_lens, 1.9)),
         Kind("f of 0.6 times, board, single", _board, partial(other_lens, 0.6), False),
         *(Kind(f"f of {share:g} times, facing board", _facing, partial(other_lens, share),

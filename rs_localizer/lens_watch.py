@@ -72,6 +72,7 @@ class LensWatch:
         self._other: Localizer | None = None  # with the matrix that frames tell, if they doubt K
         if self._exposure is not None:
             self._together = FramesTogether(self._exposure, self._config)
+            self._allow_other(self._together)
         self._count, self._next, self._jumped = 0, FRAMES, False
 
     @property
@@ -202,12 +203,15 @@ class LensWatch:
         if len(self._posed) < FRAMES or self._count < self._next:
             return
         self._together.add(list(self._posed))
-        other = self._together.other
-        self._other = None if other is None else Localizer(other[0], self._config)
+        self._allow_other(self._together)
         if self._together.is_enough:
             self._next = self._count + min(self._count, _RARELY)
         else:
             self._next = self._count + max(self._count // _SOON, FRAMES)
+
+    def _allow_other(self, together: FramesTogether) -> None:
+        other = together.other
+        self._other = None if other is None else Localizer(other[0], self._config)
 
     def is_beyond(self, found: Estimate) -> bool:
         """Return whether one frame's smooth error is beyond what is declared."""

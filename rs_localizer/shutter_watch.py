@@ -91,6 +91,9 @@ _GLOBAL = 0.2
 # Orientations widen by what a stabilizer turns in this time (s): a hand sways at 0.8 Hz.
 # Before one is told from a longer readout time, they do so if rows show that by so many deviations.
 _SWAY, _LONGER = 0.2, 3.0
+# In the first frames by no more than this (rad): a stabilizer that crops a tenth of an image turns it
+# by some 2 deg.
+_CROPPED = 0.035
 # Logarithms of the odds of another shutter at which it is doubted, no longer doubted (a robot that
 # drives slowly shows neither) and certain, and of rest before a global shutter.
 _SUSPICIOUS, _SHOWN, _CERTAIN, _AT_REST = 4.0, -2.0, 10.0, 20.7
@@ -243,9 +246,10 @@ class ShutterWatch:
         if self._camera is None:
             return found
         own = np.r_[found.angular_velocity, found.linear_velocity]
-        if self.error or self._turned:
+        sway = self._sway(float(np.linalg.norm(found.angular_velocity)))
+        if self.error or sway:
             calibration = found.calibration_covariance.copy()
-            calibration[TURN, TURN] += (_SWAY * self._turned) ** 2 * np.eye(3)
+            calibration[TURN, TURN] += sway**2 * np.eye(3)
             longer = self.error / self._usual * own
             calibration[VELOCITIES, VELOCITIES] += np.outer(longer, longer)
             found = replace(found, calibration_covariance=calibration)
@@ -379,12 +383,29 @@ class ShutterWatch:
         return float(changes / (6.0 * speeds)) if speeds else 0.0
 
     @property
+    def _longer(self) -> bool:
+        """Whether rows seem to take longer than is set."""
+        more = self._mean[0] - self._usual
+        return bool(more > _LONGER * math.sqrt(self._covariance[0, 0]))
+
+    @property
     def _turned(self) -> float:
         """Rate (rad/s, rms) at which images may be turned as wholes."""
-        longer = self._mean[0] - self._usual > _LONGER * math.sqrt(self._covariance[0, 0])
-        most = self._rotations.most if longer and not self.kind else 0.0
+        most = self._rotations.most if self._longer and not self.kind else 0.0
         rate = self._rotations.rate if self._rotations.is_likely else most
         return 0.0 if self._across else rate / self._usual
+
+    def _sway(self, rate: float) -> float:
+        """Return by what angle (rad) images may be turned as wholes.
+
+        ``rate``: rad per readout, of the camera. In the first frames, what looks like a longer
+        readout time, or like rotations beside those between images, may be a stabilizer.
+        """
+        if self.kind or self._across or self._rotations.are_enough:
+            return _SWAY * self._turned
+        longer = self._longer * (float(self._mean[0]) / self._usual - 1.0) * rate
+        early = _SWAY * max(self._rotations.most, longer) / self._usual
+        return max(_SWAY * self._turned, min(early, _CROPPED))
 
     def _along(self, axis: int) -> MeasuredReadout:
         """Return the readout time along an axis, if the shutter moves along it."""

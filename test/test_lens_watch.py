@@ -74,6 +74,8 @@ def test_two_frames_that_another_matrix_explains_refuse_all_until_they_are_old()
         ("f of 1.9 times, board", 0, 12, "a focal length 0.5"),
         ("f of 0.6 times, facing board", 0, 50, "a focal length 1.6"),
         ("right: facing board", 110, 0, ""),
+        ("f of 1.1 times, facing board", 110, 80, ""),
+        ("K of 1280 x 720, facing board", 50, 6, "a focal length 0.6"),
         ("squeezed by 2 %, corner", 110, 2, "fy over fx 0.98 times K's"),
         ("squeezed by 25 %, corner", 0, 6, "fy over fx 0.75"),
         ("map stretched by 1 %, wall", 110, 10, "a map that is longer by"),
@@ -148,7 +150,7 @@ def test_a_map_that_is_longer_one_way_moves_as_frames_tell(angle, surely):
     # One half of it is a stretch that frames show, the other half that all is larger. Along the
     # columns fy over fx may have half of it.
     off = stretch.at(board + longer).sum(axis=2) - longer
-    assert np.linalg.norm(off) < (0.3 if surely else 0.6) * np.linalg.norm(longer)
+    assert np.linalg.norm(off) < (0.35 if surely else 0.6) * np.linalg.norm(longer)
     found = re.search(r"longer by (\S+) % along \((\S+), (\S+), (\S+)\)", tracker.lens.fault)
     assert (found is not None) == surely
     if found is not None:

@@ -23,7 +23,7 @@ from rs_localizer.core.lens_laws import LensLaw
 # No model has fewer coefficients; k1, k2 stand first in all, and p1, p2 behind them.
 _FEWEST = 4
 _OF_MATRIX = 4  # focal lengths and centre
-_MOST_DECENTRED = 0.2  # of width and height
+_MOST_DECENTRED = 0.15  # of width and height
 # What is the same for all frames of a camera; of the cameras of a rig, and lenses that are tried.
 _remembered = lru_cache(64)
 

@@ -20,7 +20,6 @@ import math
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
-from functools import partial
 from itertools import compress
 from typing import NamedTuple
 
@@ -31,7 +30,7 @@ from rs_localizer.config import LocalizerConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, Array1, Array2, Array3, IntArray1
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.lens import centre_of
+from rs_localizer.core.lens import centre_of, off_centre
 from rs_localizer.core.rig import Exposure, Mounts, Rig
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import (
@@ -58,13 +57,14 @@ _MOST = 60
 # Threes that are kept: those that tell most of the focal length (its logarithm). It is known if its
 # deviation is less than the second.
 _KEPT, _KNOWN = 8, 0.02
-# Rounds of Gauss and Newton for each new three, the last of which moves no pose and no number by
-# more than this (with 4e-3 wrong lenses are told late). Each linearizes one three anew: that of
-# which poses, or shared numbers in units of the last, have moved most.
-_ROUNDS, _LEAST_STEP, _NEAR = 8, 1e-3, (0.3, 0.05, 0.02)
-_EXACT_ROUNDS = 5  # of all threes, three of which are enough before ceilings
+# Rounds of Gauss and Newton at most, the last of which moves no number by more than this part of
+# its deviation, and no pose by more than this. Short of that, a focal length seems to be known
+# where it is not.
+_ROUNDS, _NEAR, _LEAST_STEP = 20, 0.1, 1e-3
 _LEAST_NOISE = 0.1  # px, no real error is smaller
 _OF_MEDIAN = 1.386  # median of the squared errors of a point, over the variance of a coordinate
+# Of other images, widths over that of K's.
+_SIZES = (0.25, 4.0)
 # Focal lengths from which the search also starts, over K's.
 _LENGTHS = (0.6, 1.7)
 # The largest step of a number: beyond it the linear terms no longer hold; usual steps of the first
@@ -260,13 +260,6 @@ class _Three:
         self.variance = _variance(residuals**2)  # px^2, that each frame leaves alone
         self.equations: _Equations | None = None
 
-    def staleness(self, numbers: Array) -> float:
-        """Return how far shared numbers (11,) and poses are from where the linear terms hold."""
-        there = self.equations
-        assert there is not None
-        shared = np.abs((numbers - there.numbers)[:3]) / _NEAR
-        return float(max(shared.max(), np.abs(there.step[:_STAMP]).max() / _LEAST_STEP))
-
     def linearize(self, numbers: Array, principal: Array, least: float) -> None:
         """Linearize at these shared numbers (11,), where its own ones move to.
 
@@ -454,8 +447,13 @@ class FramesTogether:
         given = config.calibration
         self._exposure, self._map_deviation = exposure, config.map_deviation
         self._most_variance = config.inlier_threshold**2
-        self._of_lens = given.principal_point, given.principal_point, given.distortion
-        centre = math.hypot(_USUAL * exposure.cameras[0].focal_length, given.principal_point)
+        (camera,) = exposure.cameras
+        # A K of another image has its principal point where no lens of this one has it.
+        self._is_doubtful = off_centre(camera)
+        away = 0.5 * np.array(camera.size) - centre_of(camera) if self._is_doubtful else np.zeros(2)
+        own = np.hypot(away, given.principal_point)
+        self._of_lens = np.append(own, given.distortion)
+        centre = math.hypot(_USUAL * camera.focal_length, given.principal_point)
         usual = math.hypot(_USUAL, given.focal_length), max(given.aspect_ratio, _EXACT)
         self._usual = np.array([*usual, centre, centre])
         self._threes: list[_Three] = []
@@ -472,6 +470,11 @@ class FramesTogether:
         if frames doubt K."""
         self.other: tuple[Camera, Array] | None = None
         """The camera that frames then tell, and deviations (4,) of these numbers of it."""
+        if self._is_doubtful:
+            larger = np.log(0.5 * np.array(camera.size) / np.maximum(centre_of(camera), 1.0))
+            numbers = np.r_[np.clip(larger.mean(), *np.log(_SIZES)), 0.0, away]
+            self.doubt = np.r_[_ANY[_LENGTH], 0.0, own]
+            self.other = self._another(*numbers), self.doubt
 
     @property
     def is_enough(self) -> bool:
@@ -509,9 +512,10 @@ class FramesTogether:
         found = Matrix(math.exp(length), math.exp(aspect), centre[0], centre[1])
         self.matrix = found if told.any() else None
         doubtful = self._beyond(fit, _DOUBTFULLY) > 0.0
-        numbers, deviations = (doubtful * each[_OF_K] for each in (fit.numbers, fit.deviations))
+        allowed = doubtful | self._is_doubtful
+        numbers, deviations = doubtful * fit.numbers[_OF_K], allowed * fit.deviations[_OF_K]
         self.doubt = np.hypot(numbers, deviations)
-        self.other = (self._another(*numbers), deviations) if doubtful.any() else None
+        self.other = (self._another(*numbers), deviations) if allowed.any() else None
         sizes, deviations = fit.numbers[_STRETCHED], fit.deviations[_STRETCHED]
         by_more = np.sqrt(np.maximum(sizes**2 - deviations**2, 0.0))
         # Frames that do not tell the readout time are not of the motion between them, or at rest.
@@ -563,7 +567,6 @@ class FramesTogether:
         known[_OF_K], start[_OF_K] = np.maximum(known[_OF_K], self._usual**-2.0), 0.0
         given = [_Three(self._exposure, three.posed, self._map, 0.0) for three in threes]
         with_k = self._fitted(given, start, np.zeros(2), known)
-        fit = self._fitted(threes, fit.numbers, principal, self._known)
         variance = max(fit.variance, self._least_variance(threes))
         worse = with_k.cost(variance) - fit.cost(variance)
         if worse > (_DOUBTFULLY * fit.wider) ** 2:
@@ -601,23 +604,21 @@ class FramesTogether:
         return float(_LEAST_NOISE**2 + of_map**2)
 
     def _fitted(
-        self, threes: Sequence[_Three], start: Array, principal: Array, exactly: Array | None = None
+        self, threes: Sequence[_Three], start: Array, principal: Array, known: Array | None = None
     ) -> _Fit:
         """Return the fit of all threes, which move there.
 
-        ``exactly`` (11,): information that counts instead of what is known before any frame; all
-        threes are linearized anew in each round, so that costs can be compared.
+        ``known`` (11,): information that counts instead of what is known before any frame.
         """
         numbers, least = start, self._least_variance(threes)
-        known = self._known if exactly is None else exactly
+        known = self._known if known is None else known
         covariance: Array = np.diag(1.0 / known)
-        new = [three for three in threes if three.equations is None]
-        for three in new:
-            three.linearize(numbers, principal, least)
-        for _ in range(_ROUNDS * len(new) if exactly is None else _EXACT_ROUNDS):
+        for _ in range(_ROUNDS):
+            for three in threes:
+                three.linearize(numbers, principal, least)
             information, slope = _summed(threes, known, numbers)
             try:
-                covariance[:] = np.linalg.inv(information + np.diag(self._known - known))
+                covariance = np.linalg.inv(information + np.diag(self._known - known))
                 step = -np.linalg.solve(information + _DAMPING, slope)
             except np.linalg.LinAlgError:
                 break
@@ -625,16 +626,11 @@ class FramesTogether:
             if not math.isfinite(farthest):
                 break
             numbers = numbers + step * min(1.0, _MOST_STEP / farthest)
-            if exactly is not None:
-                for three in threes:
-                    three.linearize(numbers, principal, least)
-                continue
-            stalest = max(threes, key=partial(_Three.staleness, numbers=numbers))
-            if stalest.staleness(numbers) > 1.0:
-                stalest.linearize(numbers, principal, least)
-            elif farthest < _LEAST_STEP:
+            poses = max(np.abs(there.step[:_STAMP]).max() for there in _linear(threes))
+            near = np.abs(step) < _NEAR * np.sqrt(np.diag(covariance))
+            if near.all() and poses < _LEAST_STEP:
                 break
-        linear = [three.equations for three in threes if three.equations]
+        linear = _linear(threes)
         squared = np.concatenate([there.squared_errors for there in linear])
         wider = _ALIKE * _disagreement(linear, numbers)
         unlikely = known @ numbers**2 + sum(three.known @ three.own**2 for three in threes)
@@ -751,11 +747,15 @@ class CamerasTogether:
         return texts
 
 
+def _linear(threes: Sequence[_Three]) -> list[_Equations]:
+    return [three.equations for three in threes if three.equations]
+
+
 def _summed(threes: Sequence[_Three], known: Array, numbers: Array) -> tuple[Array, Array]:
     """Return information (11,11) and slope (11,) of all threes and what is known, there."""
     information: Array = np.diag(known)
     slope = known * numbers
-    for there in (three.equations for three in threes if three.equations):
+    for there in _linear(threes):
         information = information + there.information
         slope = slope + there.slope + there.information @ (numbers - there.numbers)
     return information, slope
