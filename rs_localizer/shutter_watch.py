@@ -91,8 +91,8 @@ _GLOBAL = 0.2
 # Orientations widen by what a stabilizer turns in this time (s): a hand sways at 0.8 Hz.
 # Before one is told from a longer readout time, they do so if rows show that by so many deviations.
 _SWAY, _LONGER = 0.2, 3.0
-# In the first frames by no more than this (rad): a stabilizer that crops a tenth of an image turns it
-# by some 2 deg.
+# In the first frames by no more than this (rad): a stabilizer that crops a tenth of an image turns
+# it by some 2 deg.
 _CROPPED = 0.035
 # Logarithms of the odds of another shutter at which it is doubted, no longer doubted (a robot that
 # drives slowly shows neither) and certain, and of rest before a global shutter.

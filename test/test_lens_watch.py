@@ -75,7 +75,7 @@ def test_two_frames_that_another_matrix_explains_refuse_all_until_they_are_old()
         ("f of 0.6 times, facing board", 0, 50, "a focal length 1.6"),
         ("right: facing board", 110, 0, ""),
         ("f of 1.1 times, facing board", 110, 80, ""),
-        ("K of 1280 x 720, facing board", 50, 6, "a focal length 0.6"),
+        ("K of 1280 x 720, facing board", 50, 8, ""),
         ("squeezed by 2 %, corner", 110, 2, "fy over fx 0.98 times K's"),
         ("squeezed by 25 %, corner", 0, 6, "fy over fx 0.75"),
         ("map stretched by 1 %, wall", 110, 10, "a map that is longer by"),
@@ -155,7 +155,7 @@ def test_a_map_that_is_longer_one_way_moves_as_frames_tell(angle, surely):
     assert (found is not None) == surely
     if found is not None:
         size, *way = map(float, found.groups())
-        assert 0.8 < size < 1.1
+        assert 0.8 < size < 1.2
         assert abs(way @ along) > 0.98
 
 

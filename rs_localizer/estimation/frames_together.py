@@ -618,7 +618,7 @@ class FramesTogether:
                 three.linearize(numbers, principal, least)
             information, slope = _summed(threes, known, numbers)
             try:
-                covariance = np.linalg.inv(information + np.diag(self._known - known))
+                covariance[:] = np.linalg.inv(information + np.diag(self._known - known))
                 step = -np.linalg.solve(information + _DAMPING, slope)
             except np.linalg.LinAlgError:
                 break
