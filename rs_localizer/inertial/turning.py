@@ -239,11 +239,12 @@ def read(
     found = errors.corrected(samples.angular_velocity[first:last])
     spectrum = spectrum_of(samples.times_ns, samples.angular_velocity, errors.noise)
     aside = 1e-9 * reach_ns + MARGIN * period
-    # Since a frame long ago readings are many: those of the rows suffice, as noise averages out.
+    # Waves of the spectrum repeat after two of its pieces: of a frame long ago readings are taken
+    # as they are.
     for back, ahead in ((max(length, half), max(-length, half)), (half, half)):
         begin = int(times.searchsorted(-back - aside))
         end = int(times.searchsorted(ahead + aside))
-        if end - begin <= _MOST:
+        if end - begin < len(spectrum.frequencies):
             break
     near = slice(max(min(begin, end - len(spectrum.frequencies)), 0), end)
     finer = np.empty(2 * len(times[near]) - 1)
