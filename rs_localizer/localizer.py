@@ -499,8 +499,9 @@ class Localizer:
             rolling=rolling,
         )  # fmt: skip
         if failure is not None:
-            others = rolling and not tracked and reordered(self._search, observed, gate)
-            return others or failure
+            searched = rolling and not tracked
+            in_order = reordered(self._search, observed, gate) if searched else None
+            return failure if in_order is None else in_order
         odd = LeftOut()
         if rolling:  # a global shutter leaves out rows of one that moves
             odd = left_out(self._search, observed, posterior, gate, known=tracked)

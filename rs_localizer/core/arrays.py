@@ -3,7 +3,7 @@
 """The kinds of arrays that pass through the package, and checks of what callers pass."""
 
 from numbers import Real
-from typing import Annotated, TypeVar
+from typing import Annotated, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +53,12 @@ _MOST = np.finfo(float).max
 
 def real(name: str, value: object, kind: str, low: float = -_MOST, high: float = _MOST) -> None:
     """Raise ``ValueError``, saying what was passed, unless ``low <= value <= high``."""
-    if not (isinstance(value, Real) and low <= float(value) <= high):
+    known = isinstance(value, Real) or (isinstance(value, np.ndarray) and value.ndim == 0)
+    try:
+        inside = known and low <= float(cast("float", value)) <= high
+    except (TypeError, OverflowError):  # of a duration, or as large as no float is
+        inside = False
+    if not inside:
         raise ValueError(f"{name} must be {kind}, got {value!r}")
 
 

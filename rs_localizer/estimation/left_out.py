@@ -136,7 +136,7 @@ def left_out(
     failure = None if known else by_chance(observed, posterior, threshold)
     if failure is not None:
         return LeftOut(failure, _rough(observed, posterior) if wide else "")
-    if not known and 2 * found < len(inliers):
+    if not known and (wide or 2 * found < len(inliers)):
         failure = reordered(search, observed, threshold)
         if failure is not None:
             return LeftOut(failure)

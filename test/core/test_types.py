@@ -125,6 +125,10 @@ def test_what_a_result_says_of_itself():
         found.at_time(2e7)
     with pytest.raises(ValueError, match="seconds must be a finite number, got '0'"):
         found.at_time("0")
+    for wrong in (np.timedelta64(1, "ms"), 10**400):
+        with pytest.raises(ValueError, match="must be"):
+            found.at_time(wrong)
+    assert found.at_time(np.array(0.01)).span == found.span
     with pytest.raises(ValueError, match="the readout time is unknown"):
         replace(found, span=0.0).at_time(0.01)
     nothing = Failure(Reason.DEGENERATE, "a line")

@@ -230,9 +230,10 @@ def test_a_fast_camera_may_leave_out_a_few_points_that_lie_near():
 
 
 @pytest.mark.parametrize("order", [[1, 2, 3, 0], [2, 3, 0, 1]])
-def test_corners_of_markers_in_another_order_have_no_pose(order):
+@pytest.mark.parametrize("seed", [5, 6, 7])
+def test_corners_of_markers_in_another_order_have_no_pose(order, seed):
     """Nobody says which points are a marker's: four in a row that are a square."""
-    random, said = np.random.default_rng(5), []
+    random, said = np.random.default_rng(seed), []
     for _ in range(8):
         camera, points, pixels, _ = frame("markers", "right", random)
         if len(points) == 40:  # all of each marker
@@ -240,7 +241,7 @@ def test_corners_of_markers_in_another_order_have_no_pose(order):
             result = rsl.Localizer(camera).localize(points, turned)
             assert not result
             said.append("come in another order" in result.detail)
-    assert any(said)
+    assert sum(said) > len(said) // 2
 
 
 @pytest.mark.parametrize(("seed", "markers"), [(18, 4), (24, 6), (35, 6)])
