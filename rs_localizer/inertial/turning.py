@@ -237,7 +237,9 @@ def read(
     times = np.asarray(1e-9 * (samples.times_ns[first:last] - here_ns), np.float64)
     period = float(times[-1] - times[0]) / (len(times) - 1)
     found = errors.corrected(samples.angular_velocity[first:last])
-    spectrum = spectrum_of(samples.times_ns, samples.angular_velocity, errors.noise)
+    # Up to the first one after the rows: how many others have come differs from run to run.
+    come = span.stop - MARGIN + 1
+    spectrum = spectrum_of(samples.times_ns[:come], samples.angular_velocity[:come], errors.noise)
     aside = 1e-9 * reach_ns + MARGIN * period
     # Waves of the spectrum repeat after two of its pieces: of a frame long ago readings are taken
     # as they are.
