@@ -33,7 +33,8 @@ _CERTAIN = {1: 10.83, 3: 16.27}
 # Rates of so many times the camera's are those of another unit. Rates and mounts (rad) that are
 # closer than these to the camera's are learned from frame to frame.
 _DEGREES, _FASTER, LEANING = math.degrees(1.0), math.log(1.4), 0.25
-# Part of a camera's rates that is none, if the camera turns faster than its noise (rad/s).
+# A gyroscope that shows less than this part of a camera's rates shows none of them; the camera has
+# to turn faster than images are wrong about it (rad/s).
 _STILL, _TURNING = 0.003, 0.1
 
 

@@ -10,12 +10,10 @@ a bias ``b``, a delay ``d`` of its stamps, scales ``S`` of its axes and a turn `
 The rotation is a mean and a covariance of numbers that are linear in the rates. Delays are
 sampled, because a vibration is not linear in them: its mean square is then in the covariance.
 
-A gyroscope filters what it shows below half its sample rate, so its samples tell the rates between
-them; but a cubic spline through the samples loses 4 % of a vibration at 0.3 of the sample rate (3
-deg/s of 0.1 deg at 120 Hz and 400 Hz). The best guess of a process whose spectrum is flat up to a
-limit (a Gaussian process with a cardinal sine as covariance; Wiener, 1949) loses 0.15 %, with four
-samples on each side. It is taken half way between the samples; for what lies between those, cubics
-are good enough.
+The rates between samples, and their covariance, are those of a Gaussian process (Wiener, 1949). Its
+spectrum and the noise are read from some tenths of a second of samples. Rates are taken at the
+samples and half way between them. There a cubic spline through the samples would lose 4 % of a
+vibration at 0.3 of the sample rate; for what lies between those, cubics are good enough.
 """
 
 from __future__ import annotations
@@ -49,8 +47,8 @@ _SKEW = 0.003
 _REACH, _MOST_DELAYS = 2.5, 81
 # Share of the samples' period: shifts by less leave all that samples show.
 _SHORT = 0.3
-# s of a shift that rounding does not decide; (rad per readout)^2 of noise, likewise.
-_LEAST_SHIFT, _LEAST_NOISE = 1e-6, 1e-11
+# s of a shift that rounding does not decide.
+_LEAST_SHIFT = 1e-6
 # (rad per readout)^2 of the noise of rates, and size of an in-frame turn over an ordinary one: it
 # is as small as it can be beside a constant change of the rate.
 _USUAL_NOISE, _SIZE = 1e-13, 0.003
@@ -148,23 +146,17 @@ def smoothed(
     return other @ (own.T @ told[:, :3]), left
 
 
-def _parts_by_rates() -> tuple[Array, Array, Array]:
-    """Return how rates (n,) tell of a rate, its change and an in-frame turn.
-
-    Returns:
-        information (20,20) by rates of unit noise, and that of any rotation; derivatives (20,n) of
-        the numbers by rates with little noise.
-    """
+def _parts_by_rates() -> Array:
+    """Return the derivatives (20,n) of a rate, its change and an in-frame turn by rates (n,)."""
     rates = shake_functions(_TAU)[1] + MIDDLE_RATES
     shown = np.column_stack([np.ones(len(_TAU)), _TAU, rates @ COMBINATIONS])
     weights = np.gradient(_TAU)
     known = (shown.T * weights) @ shown
     prior = np.diag(np.repeat([1.0, _SIZE**-2], [2, RESOLVED]))
-    by_rates = np.linalg.solve(known + _USUAL_NOISE * prior, shown.T * weights)
-    return known, prior, by_rates
+    return np.asarray(np.linalg.solve(known + _USUAL_NOISE * prior, shown.T * weights), np.float64)
 
 
-_KNOWN, _PRIOR, _PARTS = _parts_by_rates()
+_PARTS = _parts_by_rates()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
