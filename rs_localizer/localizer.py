@@ -418,7 +418,7 @@ class Localizer:
     ) -> Posterior:
         """Return the posterior before a map that is off by more than anybody said.
 
-        How far its points are off is learnt from the frame, and is then what ``map_deviation`` is.
+        The frame tells how far its points are off, and is then fitted with that ``map_deviation``.
         """
         noise, vibrating = 0.0, posterior
         most = max(_ROUGHEST * assumed.focal_length, posterior.noise)

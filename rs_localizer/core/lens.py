@@ -23,7 +23,9 @@ from rs_localizer.core.lens_laws import LensLaw
 # No model has fewer coefficients; k1, k2 stand first in all, and p1, p2 behind them.
 _FEWEST = 4
 _OF_MATRIX = 4  # focal lengths and centre
-_MOST_DECENTRED = 0.15  # of width and height
+# Of width and height: the centre of a phone is off by 0.01, the one of a real lens whose
+# calibration failed by 0.18, and a K of 1920 x 1080 on an image of 1280 x 720 by 0.25.
+_MOST_DECENTRED = 0.15
 # What is the same for all frames of a camera; of the cameras of a rig, and lenses that are tried.
 _remembered = lru_cache(64)
 

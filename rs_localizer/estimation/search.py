@@ -428,14 +428,10 @@ class MotionSearch:
         return other if other.cost < found.cost else found
 
     def optimize(
-        self,
-        observed: Observed,
-        state: Array,
-        first_scale: float,
-        terms: PriorTerms,
+        self, observed: Observed, state: Array, first_scale: float, terms: PriorTerms,
         last_scale: float | None = None,
     ) -> Candidate:  # fmt: skip
-        """Optimize one state locally, down to the inlier threshold."""
+        """Optimize one state locally, down to a scale (px; None: the inlier threshold)."""
         optimized, cost = optimize(
             state[None], np.zeros(1), observed.observations.packed, first_scale,
             last_scale or self._config.inlier_threshold, terms, self._noise,

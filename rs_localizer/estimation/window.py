@@ -99,7 +99,7 @@ _UNSHAKEN = np.eye(PARAMETERS, PARAMETERS + 3 * len(MIDDLE_VALUES))
 _UNSHAKEN[TURN, PARAMETERS:] = -np.kron(MIDDLE_VALUES, np.eye(3))
 _UNSHAKEN[ANGULAR, PARAMETERS:] = -np.kron(MIDDLE_RATES, np.eye(3))
 _ORIGIN = np.zeros(3)
-# Which deviation the axes have.
+# Places of the deviations of a velocity: each turn has its own, all moves share the last.
 _AXES = (0, 1, 2, 3, 3, 3)
 # Powers of a time in velocities and accelerations, by the places of a step.
 _ORDERS = np.repeat([0.0, 0.0, 1.0, 1.0, 2.0, 2.0], 3)

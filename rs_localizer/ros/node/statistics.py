@@ -21,7 +21,7 @@ _FEWEST = 8  # intervals of which something can be said
 _LOOSE = 0.2
 _MOST_LOOSE = 0.1  # share of intervals that may be further off
 WINDOW = 5.0
-"""What "now" means, in s."""
+"""Seconds of the past that rates and shares are counted over."""
 
 
 def missing(stamps_ns: Sequence[int]) -> int:
