@@ -92,6 +92,7 @@ MIDDLE_POSE = np.zeros_like(MIDDLE)
 MIDDLE_POSE[TURN] = MIDDLE[TURN]
 # Variances of a pose that nothing predicts, rad^2 and m^2.
 _ANYWHERE = 1e4
+_NO_READINGS = Unused(ImuReason.LATE, "no readings of the exposure have come")
 
 
 class _Foreseen(NamedTuple):
@@ -157,7 +158,7 @@ class GyroscopeTrack:
         self._begin()
         self._former: GyroscopeErrors | None = None
         self._last_ns: int | None = None
-        self._unused: Unused | None = Unused(ImuReason.LATE)
+        self._unused: Unused | None = _NO_READINGS
         self._contradictions: deque[bool] = deque(maxlen=_WATCHED)
         self._age = 0  # frames since the numbers began
         self._turns = ComparedTurns()
@@ -204,7 +205,7 @@ class GyroscopeTrack:
             walked = 1e-9 * (middle_ns - self._last_ns) * self._walk
             covariance = self.errors.covariance + np.diag(walked)
             self.errors = replace(self.errors, covariance=covariance)
-        self._last_ns, self._unused = middle_ns, Unused(ImuReason.LATE)
+        self._last_ns, self._unused = middle_ns, _NO_READINGS
         if samples is None or len(samples) == 0:
             self.forget_motion()
             return None
@@ -333,7 +334,8 @@ class GyroscopeTrack:
         # What was contradicted often agrees by chance where the camera hardly turns.
         reason = ImuReason.DISAGREES if self.contradicted else ImuReason.DOUBTED
         is_used = agrees and not self.contradicted
-        self._unused = None if is_used else Unused(reason, self._oddity())
+        said = self._oddity() or "the camera and the gyroscope turn differently"
+        self._unused = None if is_used else Unused(reason, said)
         return is_used
 
     @property

@@ -7,6 +7,7 @@ Frames are written as they come; of each, some numbers stay (250 bytes).
 
 from __future__ import annotations
 
+import itertools
 import textwrap
 import time
 from array import array
@@ -143,6 +144,7 @@ class Tally:
     track: Track = field(default_factory=Track)
     correction: CorrectionState = field(default_factory=CorrectionState)  # of map -> odom
     refused: Counter[Reason] = field(default_factory=Counter)
+    details: dict[Reason, str] = field(default_factory=dict)  # the latest of each
     last_refusal: str = "nothing came"
     not_sent: int = 0
     repeated: int = 0
@@ -166,6 +168,7 @@ class Tally:
     def refuse(self, refusal: Refusal) -> None:
         """Count a message without one."""
         self.refused[refusal.reason] += 1
+        self.details[refusal.reason] = refusal.detail
         self.last_refusal = f"{refusal.reason}: {refusal.detail}"
 
     def finish(self, localizer: FrameLocalizer) -> None:
@@ -306,13 +309,9 @@ def summary(tally: Tally, config: NodeConfig, out: Path, timed: bool = True) -> 
             ("  vibrating, left as they were", smoothed.shaken),
         ]
     lines = [f"{name:40} {text!s:>8}" for name, text in rows]
-    reasons = (*tally.refused, *(tally.aid.reasons if tally.aid else ()))
-    sentences: dict[str, str] = {it: f"{it.means}; {it.look_at}" for it in reasons}
-    for name, text in (
-        sentences | {name: text for name, (_, text) in tally.notices.items()}
-    ).items():
-        if text:
-            lines += textwrap.wrap(f"{name}: {text}", _WIDTH, subsequent_indent="    ")
+    said = tally.details.items(), ((name, text) for name, (_, text) in tally.notices.items())
+    for name, text in itertools.chain(*said):
+        lines += textwrap.wrap(f"{name}: {text}", _WIDTH, subsequent_indent="    ")
     if (fault := readout_fault(config.readout_time, tally.period)) is not None:
         lines.append(f"warning: {fault}")
     if tally.localized and not tally.moving:

@@ -48,12 +48,6 @@ _SOME = 30
 _ANY_OFFSET, _GIVEN_OFFSET = 0.02, 0.002
 
 
-def in_words(unused: Unused) -> str:
-    """Describe a reason and what was found."""
-    means = unused.reason.means
-    return f"{means}: {unused.detail}" if unused.detail else means
-
-
 @dataclass(frozen=True, slots=True)
 class AidState:
     """State of the IMU, for people."""
@@ -71,7 +65,7 @@ class AidState:
     def values(self) -> dict[str, str]:
         """Return values by readable names, without what is not known."""
         alone = self.mostly if self.share < FEW else None
-        use = "used" if alone is None else f"not used: {in_words(alone)}"
+        use = "used" if alone is None else f"not used: {alone.detail}"
         values = {"IMU": use, "IMU used (share of the last frames)": f"{self.share:.0%}"}
         if self.gravity is not None:
             finite = math.isfinite(self.gravity)
@@ -196,9 +190,11 @@ class AidInput:
         if not self._wanted(config):
             return localized(None)
         if tracker.aid is None:
-            unknown = config.readout_time == 0.0
-            reason = ImuReason.NO_READOUT_TIME if unknown else ImuReason.NOT_TRACKING
-            self._count(config, None, Unused(reason))
+            unused = Unused(ImuReason.NOT_TRACKING, "the solver is for global shutters")
+            if config.readout_time == 0.0:
+                said = "readout_time is 0: messages have no row"
+                unused = Unused(ImuReason.NO_READOUT_TIME, said)
+            self._count(config, None, unused)
             return localized(None)
         start_ns, end_ns = frame.exposure()
         samples = self._samples(frame, start_ns, end_ns, end_ns + _AROUND_NS)
@@ -266,7 +262,7 @@ class AidInput:
         self._in_a_row.append(unused.reason)
         if self._in_a_row.count(unused.reason) == _LONG and self._reported != unused.reason:
             self._reported = unused.reason
-            self._notice(unused.reason, f"the IMU is not used: {in_words(unused)}")
+            self._notice(unused.reason, f"the IMU is not used: {unused.detail}")
 
 
 def aid_of(config: NodeConfig, camera: Camera) -> Aid | None:

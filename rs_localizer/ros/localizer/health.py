@@ -9,10 +9,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from rs_localizer.core.reasons import ImuReason, Notice
+from rs_localizer.core.reasons import Notice
 from rs_localizer.io.messages import make_header
 from rs_localizer.io.outputs import Localized
-from rs_localizer.pipeline.aid import FEW, AidState, in_words
+from rs_localizer.pipeline.aid import FEW, AidState
 from rs_localizer.pipeline.camera_frames import DOUBTFUL
 from rs_localizer.pipeline.inputs import Role, input_in_words, input_named
 from rs_localizer.pipeline.map_to_odom import Decision, Standing
@@ -80,17 +80,15 @@ _MOST_TILT = math.radians(10.0)
 
 
 def imu_oddity(state: AidState | None) -> dict[str, str]:
-    """Return reasons why the camera goes on alone, with advice, and what contradicts gravity."""
+    """Return reasons why the camera goes on alone, and what contradicts gravity."""
     if state is None:
         return {}
     oddities = {}
     if state.mostly is not None and state.share < FEW:
-        mostly, look_at = in_words(state.mostly), state.mostly.reason.look_at
-        oddities["imu"] = f"the IMU is not used: {mostly} ({look_at})"
+        oddities["imu"] = f"the IMU is not used, {state.mostly.reason}: {state.mostly.detail}"
     if state.status is not None and state.status.oddity:
         oddities["imu.gyroscope"] = (
-            f"the camera's rotation says of the gyroscope: {state.status.oddity} "
-            f"({ImuReason.DISAGREES.look_at})"
+            f"the camera's rotation says of the gyroscope: {state.status.oddity}"
         )
     if state.gravity is not None and state.gravity > _MOST_TILT:
         oddities["imu.gravity"] = (
