@@ -1,6 +1,9 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Images of cameras that move while their rows are exposed, by the independent projector."""
+"""Cameras, what they see while their rows are exposed, and errors: one builder for all tests.
+
+Images are those of the independent projector, which shares no line with the package.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,10 +19,26 @@ from benchmarks.independent.cameras import Camera
 Pose = Callable[[np.ndarray], tuple[Rotation, np.ndarray]]
 """Rotations and places (n,3), map_from_camera, at times (n,) s from the middle row."""
 
+PLAIN = Camera(focal=500.0, distortion=(0.0,) * 5)
+
 
 def camera_of(true: Camera, **changes: Any) -> rsl.Camera:
     """The camera as it is calibrated, or as these changes have it."""
     return replace(believed(true), **changes)
+
+
+def pinhole(focal: float = 500.0, width: int = 640, height: int = 480, **more: Any) -> rsl.Camera:
+    """A camera without distortion whose principal point is the middle of its image."""
+    K = [[focal, 0.0, 0.5 * width - 0.5], [0.0, focal, 0.5 * height - 0.5], [0.0, 0.0, 1.0]]
+    return rsl.Camera(width, height, K, **{"readout_time": 0.03} | more)
+
+
+def board(columns: int, rows: int, width: float, height: float) -> np.ndarray:
+    """Corners (n,3) of a flat board about its middle."""
+    x, y = np.meshgrid(
+        width * np.linspace(-0.5, 0.5, columns), height * np.linspace(-0.5, 0.5, rows)
+    )
+    return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
 
 
 def shown(true: Camera, pose: Pose, points: np.ndarray) -> np.ndarray:
@@ -36,3 +55,56 @@ def inside(true: Camera, pixels: np.ndarray, margin: float = 0.0) -> np.ndarray:
     """Which (n,) of pixels (n,2) lie in the image."""
     last = np.array([true.width, true.height]) - 1.0
     return ((pixels >= margin) & (pixels <= last - margin)).all(axis=1)
+
+
+class Moving:
+    """A camera on its way: rotations and places (n,3), map_from_camera, at times (n,1) in s."""
+
+    def __init__(self, way: Pose, true: Camera = PLAIN) -> None:
+        self.way, self.true = way, true
+
+    def pose(self, t: Any) -> tuple[Rotation, np.ndarray]:
+        return self.way(np.asarray(t, float)[..., None])
+
+    def motion(self, t: float, step: float = 1e-5) -> rsl.Motion:
+        """The truth at one moment, velocities per readout by differences."""
+        turned, (place, before, later) = self.pose([t, t - step, t + step])
+        rotation, per_readout = turned[0].inv().as_matrix(), 0.5 * self.true.readout_time / step
+        turn = (turned[1].inv() * turned[2]).as_rotvec()
+        way = rotation @ (later - before)
+        return rsl.Motion(rotation, -rotation @ place, per_readout * turn, per_readout * way)
+
+    def frame(
+        self, t: float, points: np.ndarray, count: int, noise: float = 1.0, outliers: float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Some points and their pixels, the first ones anywhere, of an image's middle row at t."""
+        rng = np.random.default_rng(round(t * 1e4))
+        pixels = shown(self.true, lambda after: self.pose(t + after), points)
+        seen = np.flatnonzero(inside(self.true, pixels))
+        seen = rng.choice(seen, min(count, len(seen)), replace=False)
+        pixels = pixels[seen] + noise * rng.normal(size=(len(seen), 2))
+        wrong = np.arange(len(seen)) < outliers * len(seen)
+        last = self.true.width - 1, self.true.height - 1
+        pixels[wrong] = rng.uniform([0, 0], last, (wrong.sum(), 2))
+        return points[seen], pixels
+
+    def error(self, found: Any, t: float) -> np.ndarray:
+        """Errors (12,) of pose and velocities per readout, in the camera's axes."""
+        return error_of(found, self.motion(t))
+
+
+def error_of(found: Any, truth: rsl.Motion) -> np.ndarray:
+    """Errors (12,) of pose and velocities, in the camera's axes, as a covariance has them."""
+    turn = Rotation.from_matrix(found.rotation @ truth.rotation.T).as_rotvec()
+    place = -truth.rotation.T @ truth.translation
+    return np.concatenate([
+        turn, found.rotation @ (place - found.position),
+        truth.angular_velocity - found.angular_velocity,
+        truth.linear_velocity - found.linear_velocity,
+    ])  # fmt: skip
+
+
+def squared(error: np.ndarray, covariance: np.ndarray) -> float:
+    """Squared length of an error (n,) in deviations, by the first n of a covariance."""
+    known = covariance[: len(error), : len(error)]
+    return float(error @ np.linalg.solve(known, error))
