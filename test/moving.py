@@ -15,11 +15,15 @@ from scipy.spatial.transform import Rotation
 import rs_localizer as rsl
 from benchmarks.aided import believed
 from benchmarks.independent.cameras import Camera
+from rs_localizer import data
+from rs_localizer.io.trajectories import read_tum
+from rs_localizer.tools.simulation.true_motion import RecordedMotion, TrueState, sampled_states
 
 Pose = Callable[[np.ndarray], tuple[Rotation, np.ndarray]]
 """Rotations and places (n,3), map_from_camera, at times (n,) s from the middle row."""
 
 PLAIN = Camera(focal=500.0, distortion=(0.0,) * 5)
+AT_REST = rsl.Motion(np.eye(3), *np.zeros((3, 3)))
 
 
 def camera_of(true: Camera, **changes: Any) -> rsl.Camera:
@@ -57,6 +61,32 @@ def inside(true: Camera, pixels: np.ndarray, margin: float = 0.0) -> np.ndarray:
     return ((pixels >= margin) & (pixels <= last - margin)).all(axis=1)
 
 
+def resting(t: np.ndarray) -> tuple[Rotation, np.ndarray]:
+    """The way of a camera that is the map all the time."""
+    return Rotation.identity(len(t)), np.zeros((len(t), 3))
+
+
+def before(way: Pose) -> Pose:
+    """The way of a camera before which the map moves so: camera_from_map."""
+
+    def inverse(t: np.ndarray) -> tuple[Rotation, np.ndarray]:
+        rotation, place = way(t)
+        return rotation.inv(), -rotation.inv().apply(place)
+
+    return inverse
+
+
+def recorded_hand() -> tuple[Pose, TrueState]:
+    """The way of the bundled hand, in s after its start, and where it was all the time."""
+    recorded = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
+
+    def way(t: np.ndarray) -> tuple[Rotation, np.ndarray]:
+        states = recorded.state(recorded.intervals_ns[0][0], np.nan_to_num(t[:, 0]))
+        return Rotation.from_matrix(states.rotations), states.positions
+
+    return way, sampled_states(recorded)
+
+
 class Moving:
     """A camera on its way: rotations and places (n,3), map_from_camera, at times (n,1) in s."""
 
@@ -74,12 +104,17 @@ class Moving:
         way = rotation @ (later - before)
         return rsl.Motion(rotation, -rotation @ place, per_readout * turn, per_readout * way)
 
+    def pixels(self, t: float, points: np.ndarray) -> np.ndarray:
+        """Pixels (n,2) of points (n,3) in an image whose middle row is exposed at t."""
+        return shown(self.true, lambda after: self.pose(t + after), points)
+
     def frame(
-        self, t: float, points: np.ndarray, count: int, noise: float = 1.0, outliers: float = 0.0
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Some points and their pixels, the first ones anywhere, of an image's middle row at t."""
-        rng = np.random.default_rng(round(t * 1e4))
-        pixels = shown(self.true, lambda after: self.pose(t + after), points)
+        self, t: float, points: np.ndarray, count: int, noise: float = 1.0, outliers: float = 0.0,
+        seed: int | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Some points that an image shows, and their pixels: of outliers, the first, anywhere."""
+        rng = np.random.default_rng(round(t * 1e4) if seed is None else seed)
+        pixels = self.pixels(t, points)
         seen = np.flatnonzero(inside(self.true, pixels))
         seen = rng.choice(seen, min(count, len(seen)), replace=False)
         pixels = pixels[seen] + noise * rng.normal(size=(len(seen), 2))

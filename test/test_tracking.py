@@ -14,17 +14,14 @@ from benchmarks.frames.conditions import TRACKED, Condition
 from benchmarks.frames.conditions import moving as shaking
 from benchmarks.frames.judged import judge
 from benchmarks.independent.scenes import Rich
-from rs_localizer import data
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import project_rolling
-from rs_localizer.io.trajectories import read_tum
 from rs_localizer.pipeline.pose_at_time import twist_at
 from rs_localizer.shutter_watch import ShutterWatch
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
 from rs_localizer.tracking import FrameContext, Tracker
 
-from .moving import PLAIN, Moving, board, camera_of, squared
+from .moving import PLAIN, Moving, before, board, camera_of, recorded_hand, squared
 
 READOUT = PLAIN.readout_time
 CAMERA = camera_of(PLAIN)
@@ -215,15 +212,9 @@ def test_poses_and_twists_at_any_time_are_covered():
 
 def test_predictions_are_as_sure_as_a_real_hand_lets_them_be():
     """Its accelerations outlast those of the model, which predicts the next image best."""
-    recorded = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
-    start_ns = recorded.intervals_ns[0][0]
-    world = room(sampled_states(recorded).positions, np.random.default_rng(0), count=5000)
-
-    def recorded_hand(t):
-        states = recorded.state(start_ns, np.nan_to_num(t[:, 0]))
-        return Rotation.from_matrix(states.rotations), states.positions
-
-    hand, tracker, lengths = Moving(recorded_hand), tracker_of(), []
+    way, states = recorded_hand()
+    world = room(states.positions, np.random.default_rng(0), count=5000)
+    hand, tracker, lengths = Moving(way), tracker_of(), []
     for t, found in followed(times(240), 150, world, hand, 0.5, tracker):
         assert found
         if t > 0.3:
@@ -389,13 +380,11 @@ def test_after_a_third_of_a_second_without_the_board_no_pose_jumps():
     for seed in range(6):
         phase = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, (2, 3))
 
-        def way(t, phase=phase):  # of the camera before a board that moves
+        def way(t, phase=phase):  # of the board
             turn = np.array([0.25, 0.3, 0.1]) * np.sin(2.0 * t + phase[0])
-            place = 0.05 * np.sin(2.0 * t + phase[1]) + (0.0, 0.0, 0.6)
-            inverse = Rotation.from_rotvec(turn).inv()
-            return inverse, -inverse.apply(place)
+            return Rotation.from_rotvec(turn), 0.05 * np.sin(2.0 * t + phase[1]) + (0.0, 0.0, 0.6)
 
-        moving = Moving(way)
+        moving = Moving(before(way))
         for t, found in followed((*times(12), 22 / 30.0), 48, corners, moving, 0.2):
             # What is left of a wrong fit contradicts the board, and widens its region.
             assert found or (t > 0.5 and found.reason == Reason.UNCERTAIN)

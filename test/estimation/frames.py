@@ -15,7 +15,7 @@ from rs_localizer.estimation.prior import assumptions
 from rs_localizer.estimation.robust import best_motion
 from rs_localizer.solvers.table import find_solver
 
-from .projection import gradient, in_camera, jacobian_of, pixels_of, row_time
+from .projection import gradient, jacobian_of, pixels_of, project, row_time, steady
 
 READOUT = 0.03
 CAMERA = Camera(640, 480, np.diag([590.0, 590.0, 1.0]), readout_time=READOUT)
@@ -23,15 +23,21 @@ PRIOR, ASSUMED = assumptions(READOUT, Rig.of(CAMERA), LocalizerConfig(), find_so
 DIRECTION = "top_to_bottom"
 
 
-def observe(state, points, noise, rng, swing=lambda tau: np.zeros((len(tau), 3)), seen_as=None):
+def box(seed, speed, count=60, acceleration=0.0, rng=None):
+    """A state (24,), and points (n,3) 4 m before the camera."""
+    rotation = Rotation.random(random_state=seed).as_matrix()
+    rng = np.random.default_rng(seed) if rng is None else rng
+    state = np.concatenate(
+        [rotation.ravel(), [0.0, 0.0, 4.0], speed * rng.normal(size=6),
+         acceleration * rng.normal(size=6)]
+    )  # fmt: skip
+    return state, rng.uniform([-1.5, -1.2, -1.0], [1.5, 1.2, 1.0], (count, 3)) @ rotation
+
+
+def observe(state, points, noise, seed, swing=steady, seen_as=None):
     """Observations of points, each seen by its own row, in a map that says ``seen_as``."""
-    tau = np.zeros(len(points))
-    for _ in range(100):
-        seen = in_camera(state, tau, points, swing(tau))
-        pixels = pixels_of(seen[:, :2] / seen[:, 2:])
-        tau = row_time(pixels, DIRECTION)
-    measured = pixels + noise * rng.normal(size=pixels.shape)
-    rays = seen[:, :2] / seen[:, 2:]
+    rays, _ = project(state, points, swing=swing)
+    measured = pixels_of(rays) + noise * np.random.default_rng(seed).normal(size=rays.shape)
     for _ in range(20):  # Newton's method undoes the lens
         rays -= np.linalg.solve(jacobian_of(rays), (pixels_of(rays) - measured)[..., None])[..., 0]
     return Observations.of(
@@ -41,21 +47,19 @@ def observe(state, points, noise, rng, swing=lambda tau: np.zeros((len(tau), 3))
 
 
 def frame(seed, speed, noise, count=60, acceleration=0.0, **more):
-    """A box of points 4 m away, and a state that sees it."""
+    """Observations of a box of points, and the state that sees it."""
     rng = np.random.default_rng(seed)
-    rotation = Rotation.random(random_state=seed).as_matrix()
-    state = np.concatenate(
-        [rotation.ravel(), [0.0, 0.0, 4.0], speed * rng.normal(size=6),
-         acceleration * rng.normal(size=6)]
-    )  # fmt: skip
-    points = rng.uniform([-1.5, -1.2, -1.0], [1.5, 1.2, 1.0], (count, 3)) @ rotation
+    state, points = box(seed, speed, count, acceleration, rng)
     return observe(state, points, noise, rng, **more), state
 
 
-def changed(observations, points=None, gradient=None):
-    """The observations of other points (n,3), or with another gradient (2,) of the row times."""
+def changed(observations, points=None, gradient=None, rounded=0.0):
+    """The observations of other points (n,3), with another gradient (2,) of the row times, or of
+    points and rays that differ by a rounding.
+    """
+    points = observations.points if points is None else points
     return Observations.of(
-        observations.points if points is None else points, observations.rays, observations.tau,
+        points * (1.0 + rounded), observations.rays * (1.0 - rounded), observations.tau,
         observations.by_ray, observations.mounts if gradient is None else Mounts.one(gradient),
     )  # fmt: skip
 
@@ -81,3 +85,8 @@ def agree(step, covariance, expected, own, **within):
     deviations = np.sqrt(np.diag(own))
     alike(step, expected, deviations, **within)
     alike(covariance, own, deviations, **within)
+
+
+def differences(function, size, h):
+    """Derivative (...,size) of a function of a vector at zero, by central differences."""
+    return np.stack([(function(e) - function(-e)) / (2 * h) for e in h * np.eye(size)], axis=-1)

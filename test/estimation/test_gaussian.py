@@ -4,25 +4,16 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.state import step_between
 from rs_localizer.estimation import gaussian
-from rs_localizer.estimation.gaussian import (
-    Frame,
-    Gaussians,
-    Mode,
-    along_arcs,
-    linear_at,
-    mixture,
-    mode_of,
-    over_leans,
-)
 from rs_localizer.estimation.linear_fit import Noise, nothing_shared
 from rs_localizer.estimation.prior import held_terms
 
 from .frames import alike, fitted, observe
-from .projection import disturbed, in_camera, pixels_of
+from .projection import disturbed, pixels_of, project
 
 CENTRE = np.array([0.3, -0.2, 3.0])
 TURNS, MOVES = np.diag([0.05, 0.03, 0.02]), np.diag([0.001, 0.002, 0.02])
@@ -30,7 +21,7 @@ TURNS, MOVES = np.diag([0.05, 0.03, 0.02]), np.diag([0.001, 0.002, 0.02])
 
 def arched(found):
     """The covariance of a mixture to second order."""
-    return along_arcs(found.covariance[:18, :18].copy(), found.state[9:12])
+    return gaussian.along_arcs(found.covariance[:18, :18].copy(), found.state[9:12])
 
 
 def test_moments_are_those_of_cameras_on_the_arc():
@@ -43,7 +34,7 @@ def test_moments_are_those_of_cameras_on_the_arc():
     by = np.block([[np.eye(3), np.zeros((3, 3))], [np.cross(np.eye(3), CENTRE), -np.eye(3)]])
     first = np.zeros((18, 18))
     first[:6, :6] = by * deviations**2 @ by.T
-    found = along_arcs(first, CENTRE)[:6, :6]
+    found = gaussian.along_arcs(first, CENTRE)[:6, :6]
     alike(found, expected, np.sqrt(expected.diagonal()), atol=0.03)
     # Without second order the line of sight is far off.
     assert first[5, 5] < 0.95 * expected[5, 5]
@@ -60,7 +51,7 @@ def parts():
     halves = 1e-5 * rng.normal(size=(3, 24, 24))
     covariances = halves @ halves.transpose(0, 2, 1)
     turns, evidences = 1e-5 * rng.normal(size=(3, 6)), np.array([-4.0, -5.0, -3.5])
-    return Gaussians(states, turns, covariances, evidences), first
+    return gaussian.Gaussians(states, turns, covariances, evidences), first
 
 
 @pytest.mark.parametrize("temper", [1.0, 0.25])
@@ -68,7 +59,7 @@ def test_mean_and_moments_are_by_their_own_weights(parts, temper):
     """So near each other that arcs do not bend: as numbers, a mixture is a sum."""
     given, first = parts
     preferences = np.array([0.0, np.log(7.0), 0.0])
-    found = mixture(given, preferences, temper)
+    found = gaussian.mixture(given, preferences, temper)
     probable = np.exp(given.evidences) * [1.0, 7.0, 1.0]
     probable /= probable.sum()
     possible = np.exp(temper * given.evidences)
@@ -91,7 +82,7 @@ def test_mean_and_moments_are_by_their_own_weights(parts, temper):
 
 def test_a_mixture_of_one_is_itself(parts):
     given, _ = parts
-    found = mixture(Gaussians(*(each[1:2] for each in given)), np.zeros(1), 0.25)
+    found = gaussian.mixture(gaussian.Gaussians(*(each[1:2] for each in given)), np.zeros(1), 0.25)
     np.testing.assert_allclose(found.state, given.states[1], atol=1e-12)
     np.testing.assert_allclose(found.turn, given.turns[1])
     np.testing.assert_allclose(found.covariance, given.covariances[1], atol=1e-12)
@@ -103,8 +94,8 @@ def test_cameras_on_an_arc_have_their_mean_on_it():
     turns = Rotation.from_rotvec([[0.0, 0.12, 0.0], [0.0, -0.12, 0.0]]).as_matrix()
     states = np.array([[*turn.ravel(), 0.0, 0.0, 3.0, *np.zeros(12)] for turn in turns])
     covariances = np.broadcast_to(1e-8 * np.eye(18), (2, 18, 18)).copy()
-    parts = Gaussians(states, np.zeros((2, 0)), covariances, np.zeros(2))
-    found = mixture(parts, np.zeros(2), 1.0)
+    parts = gaussian.Gaussians(states, np.zeros((2, 0)), covariances, np.zeros(2))
+    found = gaussian.mixture(parts, np.zeros(2), 1.0)
     np.testing.assert_allclose(found.state[:12], [*np.eye(3).ravel(), 0.0, 0.0, 3.0], atol=1e-9)
     # In the camera's axes it moves by the arc's height, of which the ellipsoid knows nothing. The
     # fourth moment of a Gaussian is three times that of these two.
@@ -114,7 +105,6 @@ def test_cameras_on_an_arc_have_their_mean_on_it():
 
 
 COUNT = 40
-STEP = 1e-6
 
 
 def plane_frame(seed, tilt, noise):
@@ -124,33 +114,21 @@ def plane_frame(seed, tilt, noise):
     points -= np.median(points, axis=0)
     rotation = Rotation.from_euler("x", tilt, degrees=True).as_matrix()
     state = np.concatenate([rotation.ravel(), [0.0, 0.0, 1.6], np.zeros(12)])
-    noisy = np.random.default_rng(seed + 1)
-    seen = in_camera(state, np.zeros(COUNT), points, np.zeros((COUNT, 3)))
-    pixels = pixels_of(seen[:, :2] / seen[:, 2:])
-    pixels = pixels + noise * np.random.default_rng(seed + 1).normal(size=pixels.shape)
-    return observe(state, points, noise, noisy), points, pixels, state
-
-
-def errors_of(points, pixels, rotation, translation):
-    seen = points @ rotation.T + translation
-    return (pixels_of(seen[:, :2] / seen[:, 2:]) - pixels).ravel()
+    pixels = pixels_of(project(state, points)[0])
+    pixels += noise * np.random.default_rng(seed + 1).normal(size=pixels.shape)
+    return observe(state, points, noise, seed + 1), points, pixels, state
 
 
 def beside(points, pixels, rotation, translation, axes):
     """Best squared errors over turns about some axes and moves, and volume of what is left."""
-    for _ in range(4):
-        errors = errors_of(points, pixels, rotation, translation)
-        columns = []
-        for axis in axes:
-            turned = Rotation.from_rotvec(STEP * axis).as_matrix() @ rotation
-            columns.append(errors_of(points, pixels, turned, translation))
-        for shift in STEP * np.eye(3):
-            columns.append(errors_of(points, pixels, rotation, translation + shift))
-        jacobian = (np.column_stack(columns) - errors[:, None]) / STEP
-        step = -np.linalg.lstsq(jacobian, errors, rcond=None)[0]
-        turn = Rotation.from_rotvec(axes.T @ step[: len(axes)]).as_matrix()
-        rotation, translation = turn @ rotation, translation + step[len(axes) :]
-    return np.sum(errors**2), -0.5 * np.linalg.slogdet(jacobian.T @ jacobian)[1]
+
+    def errors(step):
+        turned = Rotation.from_rotvec(axes.T @ step[: len(axes)]).as_matrix() @ rotation
+        seen = points @ turned.T + translation + step[len(axes) :]
+        return (pixels_of(seen[:, :2] / seen[:, 2:]) - pixels).ravel()
+
+    fit = least_squares(errors, np.zeros(len(axes) + 3), method="lm", x_scale=0.01)
+    return 2.0 * fit.cost, -0.5 * np.linalg.slogdet(fit.jac.T @ fit.jac)[1]
 
 
 @pytest.mark.parametrize(("tilt", "noise"), [(0.0, 0.5), (12.0, 1.0)])
@@ -159,31 +137,27 @@ def test_leans_are_integrated_as_on_a_fine_grid(tilt, noise):
     terms = held_terms()
     best = fitted(observations, truth, terms, 4.0)
     assert np.all(best.inliers)
-    smooth = nothing_shared(COUNT)
     noise = Noise(best.noise, 1.0, 2.0 * COUNT - best.freedom)
-    seen = Frame(observations.packed, points, best.inliers, smooth, noise, 590.0, 1.6)
-    mode, _, _ = mode_of(seen, best.state, linear_at(seen, best.state), terms)
-    found = over_leans(seen, mode, terms)
+    inliers, smooth = best.inliers, nothing_shared(COUNT)
+    seen = gaussian.Frame(observations.packed, points, inliers, smooth, noise, 590.0, 1.6)
+    mode, _, _ = gaussian.mode_of(seen, best.state, gaussian.linear_at(seen, best.state), terms)
+    found = gaussian.over_leans(seen, mode, terms)
     rotation, translation = mode.state[:9].reshape(3, 3), mode.state[9:12]
-    normal = rotation[:, 2]
+    normal, freedom = rotation[:, 2], best.freedom
     across = np.linalg.svd(normal[None])[2][1:]
     grid = np.radians(np.arange(-36.0, 36.1, 2.0 if tilt == 0.0 else 3.0))
-    freedom = best.freedom
-    squares, volumes = np.empty((2, len(grid), len(grid)))
-    for i, a in enumerate(grid):
-        for j, b in enumerate(grid):
-            turn = Rotation.from_rotvec(a * across[0] + b * across[1]).as_matrix()
-            squares[i, j], volumes[i, j] = beside(
-                points, pixels, turn @ rotation, translation, (turn @ normal)[None]
-            )
-    # The noise is any: its logarithm is integrated out.
-    logarithms = volumes - 0.5 * freedom * np.log(squares)
-    weights = np.exp(logarithms - logarithms.max())
-    assert (
-        max(weights[0].max(), weights[-1].max(), weights[:, 0].max(), weights[:, -1].max()) < 1e-2
-    )
-    total = weights.sum()
     places = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1)
+    logarithms = np.empty(places.shape[:2])
+    for where in np.ndindex(logarithms.shape):
+        turn = Rotation.from_rotvec(places[where] @ across).as_matrix()
+        about = (turn @ normal)[None]
+        square, volume = beside(points, pixels, turn @ rotation, translation, about)
+        # The noise is any: its logarithm is integrated out.
+        logarithms[where] = volume - 0.5 * freedom * np.log(square)
+    weights = np.exp(logarithms - logarithms.max())
+    edges = weights[[0, -1]], weights[:, [0, -1]]
+    assert max(edge.max() for edge in edges) < 1e-2
+    total = weights.sum()
     mean = np.tensordot(weights, places, 2) / total
     spread = np.sqrt(np.tensordot(weights, (places - mean) ** 2, 2) / total)
     turned = Rotation.from_matrix(found.state[:9].reshape(3, 3) @ rotation.T).as_rotvec()
@@ -204,7 +178,7 @@ def test_a_lean_that_is_nearly_gaussian_has_the_moments_of_its_orders(third, fou
     covariance = np.diag(np.r_[np.full(3, 1e-4), np.full(15, 1.0)])
     covariance[:3, :3] += (deviation**2 - 1e-4) * np.outer(axis, axis)
     state = np.concatenate([np.eye(3).ravel(), np.zeros(15)])
-    mode = Mode(state, covariance, 0.0, 1.0, 1.0, 0.0, 30.0)
+    mode = gaussian.Mode(state, covariance, 0.0, 1.0, 1.0, 0.0, 30.0)
     falls = 1.0 - np.array([[fourth + third, fourth - third]])
     found = as_python(gaussian._bent_by)(mode, axis[None], falls, 0.0)
     z = np.linspace(-4.0, 4.0, 2001)

@@ -10,8 +10,11 @@ from scipy.stats import chi2
 from rs_localizer.estimation.acceptance import refusal
 from rs_localizer.estimation.hypotheses import frame_posterior
 
-from .frames import ASSUMED, PRIOR, distance, fitted, frame, observe
-from .projection import disturbed, jacobian_of
+from ..moving import board, squared  # noqa: TID252 - Python has a package "test"
+from .frames import ASSUMED, PRIOR, changed, distance, fitted, frame, observe
+from .projection import disturbed
+
+PARTS = slice(0, 6), slice(6, 12)  # pose and velocities
 
 
 def settled(seed, speed, noise=0.5, **more):
@@ -22,10 +25,7 @@ def settled(seed, speed, noise=0.5, **more):
 @pytest.mark.parametrize("frames", [30, pytest.param(60, marks=pytest.mark.bench)])
 def test_at_rest_the_truth_is_covered(frames):
     resting = [settled(seed, 0.0) for seed in range(frames)]
-    poses, twists = (
-        np.array([distance(*case, part) for case in resting])
-        for part in (slice(0, 6), slice(6, 12))
-    )
+    poses, twists = (np.array([distance(*case, part) for case in resting]) for part in PARTS)
     assert np.median(poses) < 6.6  # 5.35 of six parameters
     assert np.mean(poses < chi2.ppf(0.95, 6)) > 0.88
     # The region of the velocities holds zero, and says so of every frame but few.
@@ -34,54 +34,46 @@ def test_at_rest_the_truth_is_covered(frames):
 
 def turns(posterior):
     """Whether zero lies outside of the 95 % region of the velocities."""
-    velocities = posterior.state[12:18]
     region = posterior.covariance[6:12, 6:12]
-    return velocities @ np.linalg.solve(region, velocities) > chi2.ppf(0.95, 6)
+    return squared(posterior.state[12:18], region) > chi2.ppf(0.95, 6)
 
 
 @pytest.mark.parametrize("frames", [10, pytest.param(20, marks=pytest.mark.bench)])
 def test_a_bent_board_at_rest_does_not_turn(frames):
     """Its map says that it is flat: 40 corners 0.5 m wide, 1 m away, bent by 2 mm."""
-    x, y = (
-        axis.ravel()
-        for axis in np.meshgrid(np.linspace(-0.25, 0.25, 8), np.linspace(-0.18, 0.18, 5))
-    )
-    flat = np.column_stack([x, y, np.zeros(40)])
-    bent = flat + np.column_stack([np.zeros((40, 2)), 2e-3 * (1 - (x / 0.25) ** 2)])
+    flat = board(8, 5, 0.5, 0.36)
+    bent = flat + np.outer(2e-3 * (1 - (flat[:, 0] / 0.25) ** 2), [0.0, 0.0, 1.0])
     fooled, turning = 0, 0
     for seed in range(frames):
-        rng = np.random.default_rng(seed)
-        rotation = Rotation.from_rotvec(rng.uniform(-0.5, 0.5, 3)).as_matrix()
+        turn = np.random.default_rng(seed).uniform(-0.5, 0.5, 3)
+        rotation = Rotation.from_rotvec(turn).as_matrix()
         state = np.concatenate([rotation.ravel(), [0.0, 0.0, 1.0], np.zeros(12)])
-        observations = observe(state, bent, 0.1, rng, seen_as=flat)
+        observations = observe(state, bent, 0.1, seed, seen_as=flat)
         fooled += turns(fitted(observations, state, PRIOR, 2.0))
         turning += turns(frame_posterior(observations, state, PRIOR, 2.0, ASSUMED))
     assert fooled > frames / 2  # the best motion alone
     assert turning <= frames / 10
 
 
-def wave(cycles, swings):
-    """Turn (n,3) at row times (n,): a cosine and a sine of so many cycles per readout."""
-    return lambda tau: (
-        np.cos(2.0 * np.pi * cycles * tau)[:, None] * swings[0]
-        + np.sin(2.0 * np.pi * cycles * tau)[:, None] * swings[1]
-    )
-
-
 SWING = np.radians(0.3) * np.array([[0.6, 0.8, 0.3], [-0.8, 0.6, 0.2]])
 
 
 def shaken(seed, cycles=4.0, swings=SWING, noise=0.2, wrong=0, count=80):
-    """Observations of a wave beside a motion, and the motion (24,); some points are wrong."""
-    observations, state = frame(seed, 0.02, noise, count, swing=wave(cycles, swings))
+    """Observations of a wave beside a motion, and the motion (24,); some points are wrong.
+
+    The wave is a cosine and a sine of so many cycles per readout.
+    """
+
+    def wave(tau):
+        angle = 2.0 * np.pi * cycles * tau[:, None]
+        return np.cos(angle) * swings[0] + np.sin(angle) * swings[1]
+
+    observations, state = frame(seed, 0.02, noise, count, swing=wave)
     if not wrong:
         return observations, state
     points = observations.points.copy()
     points[:wrong] += np.random.default_rng(seed).uniform(-2.0, 2.0, (wrong, 3))
-    return type(observations).of(
-        points, observations.rays, observations.tau, jacobian_of(observations.rays),
-        observations.mounts,
-    ), state  # fmt: skip
+    return changed(observations, points), state
 
 
 def at_the_middle(state, cycles, swings):
@@ -103,7 +95,7 @@ def test_a_vibrating_camera_stays_in_its_region(frames):
         observations, state = shaken(seed, 1.8, swings, 0.1, count=100)
         found = frame_posterior(observations, state, PRIOR, 2.0, ASSUMED)
         truth = at_the_middle(state, 1.8, swings)
-        squared.append([distance(found, truth, part) for part in (slice(0, 6), slice(6, 12))])
+        squared.append([distance(found, truth, part) for part in PARTS])
         noises.append(found.noise)
         assert np.count_nonzero(~found.inliers) < 5
     assert np.mean(np.abs(np.array(noises) - 0.1) < 0.03) >= 0.85
@@ -123,11 +115,7 @@ def test_of_very_many_points_rounding_leaves_none_out():
     for seed in range(6):
         observations, state = frame(seed, 0.02, 0.5, count=2600)
         found = frame_posterior(observations, state, PRIOR, 1.0, ASSUMED)
-        rounded = type(observations).of(
-            observations.points * (1.0 + 1e-15), observations.rays * (1.0 - 1e-15),
-            observations.tau, jacobian_of(observations.rays), observations.mounts,
-        )  # fmt: skip
-        again = frame_posterior(rounded, state, PRIOR, 1.0, ASSUMED)
+        again = frame_posterior(changed(observations, rounded=1e-15), state, PRIOR, 1.0, ASSUMED)
         assert 2000 < np.count_nonzero(found.inliers) < 2600
         np.testing.assert_array_equal(found.inliers, again.inliers)
 

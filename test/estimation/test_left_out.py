@@ -16,12 +16,28 @@ from benchmarks.frames.judged import far_off, judge
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import project_rolling
 
+from ..moving import AT_REST, error_of, pinhole, squared  # noqa: TID252 - Python has a package "test"
 
-def results(scene, fault, count=6):
-    random = np.random.default_rng(5)
+FAR_6, FAR_3 = 22.5, 16.3  # 99.9 % of so many degrees of freedom
+CENTRE = np.array([319.5, 239.5])
+
+
+def frames(scene, fault="right", count=6, seed=5):
+    """Camera, points, pixels, rotation and more random numbers, so many times."""
+    random = np.random.default_rng(seed)
     for _ in range(count):
-        camera, points, pixels, _ = frame(scene, fault, random)
+        yield *frame(scene, fault, random), random
+
+
+def results(scene, fault):
+    for camera, points, pixels, *_ in frames(scene, fault):
         yield rsl.Localizer(camera).localize(points, pixels)
+
+
+def turned(result, rotation):
+    """Squared error of the orientation in deviations."""
+    off = error_of(result, replace(AT_REST, rotation=rotation))[:3]
+    return squared(off, result.covariance)
 
 
 @pytest.mark.parametrize("scene", ["corner", "markers", "volume"])
@@ -38,43 +54,34 @@ def test_right_calibrations_lose_no_frame(scene):
     ],
 )  # fmt: skip
 def test_what_has_two_poses_has_none(scene, fault):
-    found = [result for result in results(scene, fault) if result]
-    assert found == []
+    assert not any(results(scene, fault))
 
 
 @pytest.mark.parametrize(("fault", "length"), [("binned twice", 2.0), ("ROI twice", 1.0)])
 def test_another_matrix_is_named(fault, length):
-    """The true one, which nothing of the package has made."""
-    random, named = np.random.default_rng(5), 0
-    for _ in range(12):
-        camera, points, pixels, _ = frame("markers", fault, random)
+    named = 0
+    for camera, points, pixels, *_ in frames("markers", fault, 12):
         result = rsl.Localizer(camera).localize(points, pixels)
         assert not result
-        words = re.search(
-            r"length of (\S+) times K's and a principal point (\S+), (\S+) px", str(result)
-        )
-        if words is None:
-            continue
-        named += 1
-        found, *centre = (float(word) for word in words.groups())
-        assert found == pytest.approx(length, rel=0.02)
-        assert np.abs(camera.K[:2, 2] + centre - (319.5, 239.5)).max() < 10.0
+        pattern = r"length of (\S+) times K's and a principal point (\S+), (\S+) px"
+        if words := re.search(pattern, str(result)):
+            named += 1
+            found, *centre = map(float, words.groups())
+            assert found == pytest.approx(length, rel=0.02)
+            assert np.abs(camera.K[:2, 2] + centre - CENTRE).max() < 10.0
     assert named >= 2
 
 
 @pytest.mark.parametrize("share", [2.0, 0.5])
 def test_a_k_of_another_size_is_refused_before_one_wall(share):
     """Where focal length and distance go together; the principal point tells the size."""
-    random, named, published = np.random.default_rng(3), 0, 0
-    for _ in range(12):
-        camera, points, pixels, _ = frame("wall", "right", random)
-        K = camera.K * share
-        K[2, 2] = 1.0
+    named, published = 0, 0
+    for camera, points, pixels, *_ in frames("wall", count=12, seed=3):
         assert rsl.Localizer(camera).localize(points, pixels)
+        K = camera.K * [[share], [share], [1.0]]
         result = rsl.Localizer(rsl.Camera(640, 480, K, readout_time=0.02)).localize(points, pixels)
         published += bool(result)
-        found = re.search(r"a focal length of (\S+) times K's", str(result))
-        if found:
+        if found := re.search(r"a focal length of (\S+) times K's", str(result)):
             assert float(found[1]) == pytest.approx(1.0 / share, rel=0.1)
             assert result.reason == Reason.CALIBRATION
             named += 1
@@ -83,12 +90,9 @@ def test_a_k_of_another_size_is_refused_before_one_wall(share):
 
 
 def test_a_principal_point_that_is_a_little_off_is_no_other_image():
-    random = np.random.default_rng(5)
-    for _ in range(6):
-        camera, points, pixels, rotation = frame("volume", "a tenth wrong", random)
+    for camera, points, pixels, rotation, random in frames("volume", "a tenth wrong"):
         pixels[::3] += random.uniform(-20.0, 20.0, (len(pixels[::3]), 2))
-        K = np.array(camera.K)
-        K[0, 2] += 6.0
+        K = camera.K + 6.0 * np.outer([1, 0, 0], [0, 0, 1])
         result = rsl.Localizer(replace(camera, K=K)).localize(points, pixels)
         assert result
         assert np.abs(result.rotation - rotation).max() < 0.02
@@ -96,7 +100,6 @@ def test_a_principal_point_that_is_a_little_off_is_no_other_image():
 
 @pytest.mark.parametrize("bench", ["bodies", "near"])
 def test_what_moves_or_is_matched_nearby_is_left_out(bench):
-    """Of frames that none of the package has made; P3P finds all of them."""
     for _, one in paired_set.spoilt():
         if one.bench == bench:
             found = judge(one, 4, 7, {})
@@ -107,9 +110,7 @@ def test_what_moves_or_is_matched_nearby_is_left_out(bench):
 
 @pytest.mark.parametrize("deviation", [0.013, 0.05])  # 3 and 11 px at 2.2 m
 def test_noise_beyond_the_gate_is_learnt_and_named(deviation):
-    random = np.random.default_rng(4)
-    for _ in range(4):
-        camera, points, pixels, rotation = frame("volume", "right", random)
+    for camera, points, pixels, rotation, random in frames("volume", count=4, seed=4):
         points = points + deviation * random.normal(size=points.shape)
         result = rsl.Localizer(camera).localize(points, pixels)
         if len(points) < 60:
@@ -119,23 +120,19 @@ def test_noise_beyond_the_gate_is_learnt_and_named(deviation):
         words = re.search(r"set map_deviation to (\S+) m", result.left_out)
         assert words is not None
         assert float(words[1]) == pytest.approx(deviation, rel=0.3)
-        off = Rotation.from_matrix(result.rotation @ rotation.T).as_rotvec()
-        assert off @ np.linalg.solve(result.covariance[:3, :3], off) < 16.0
+        assert turned(result, rotation) < FAR_3
 
 
 @pytest.mark.parametrize("focal_length", [60.0, 130.0, 260.0])
 def test_noise_as_wide_as_rays_of_a_wide_lens_are(focal_length):
     """All points fit, so nothing was chosen: no chance made them fit."""
-    rng, k = np.random.default_rng(0), np.diag([focal_length, focal_length, 1.0])
-    k[:2, 2] = 319.5, 239.5
+    rng, localizer = np.random.default_rng(0), rsl.Localizer(pinhole(focal_length))
     for _ in range(3):
         pixels, depth = rng.uniform([0, 0], [639, 479], (100, 2)), rng.uniform(2.0, 4.0, (100, 1))
-        points = np.column_stack([(pixels - k[:2, 2]) / focal_length * depth, depth])
-        noisy = pixels + rng.normal(0.0, 5.0, pixels.shape)
-        result = rsl.Localizer(rsl.Camera(640, 480, k, readout_time=0.03)).localize(points, noisy)
+        points = depth * np.column_stack([(pixels - CENTRE) / focal_length, np.ones(100)])
+        result = localizer.localize(points, pixels + rng.normal(0.0, 5.0, pixels.shape))
         assert result, result
-        off = np.r_[Rotation.from_matrix(result.rotation).as_rotvec(), result.translation]
-        assert off @ np.linalg.solve(result.covariance[:6, :6], off) < 22.5  # 99.9 %
+        assert squared(error_of(result, AT_REST)[:6], result.covariance) < FAR_6
 
 
 @pytest.mark.parametrize(
@@ -143,45 +140,38 @@ def test_noise_as_wide_as_rays_of_a_wide_lens_are(focal_length):
 )
 def test_near_points_of_a_rough_map_do_not_make_the_others_fit_by_chance(seed, declared):
     """A street whose landmarks are off by 0.3 m: 5 m away by 30 px, at 60 m by 3."""
-    camera = rsl.Camera(640, 480, [[500, 0, 319.5], [0, 500, 239.5], [0, 0, 1]], readout_time=0.03)
     rng = np.random.default_rng(seed)
     pixels, depth = rng.uniform([0, 0], [639, 479], (100, 2)), rng.uniform(*np.log([5, 200]), 100)
-    points = np.column_stack([(pixels - [319.5, 239.5]) / 500.0, np.ones(100)])
-    points = np.exp(depth)[:, None] * points + rng.normal(0.0, 0.3, points.shape)
+    points = np.exp(depth)[:, None] * np.column_stack([(pixels - CENTRE) / 500.0, np.ones(100)])
+    points += rng.normal(0.0, 0.3, points.shape)
     pixels[:30] = rng.uniform(0, [639, 479], (30, 2))  # mismatches
-    result = rsl.Localizer(camera, map_deviation=declared).localize(points, pixels)
+    result = rsl.Localizer(pinhole(), map_deviation=declared).localize(points, pixels)
     assert result, result
-    off = np.r_[Rotation.from_matrix(result.rotation).as_rotvec(), result.translation]
-    assert off @ np.linalg.solve(result.covariance[:6, :6], off) < 22.5  # 99.9 %
+    assert squared(error_of(result, AT_REST)[:6], result.covariance) < FAR_6
 
 
 def test_gates_as_wide_as_a_motion_is_absurd_are_no_error():
     """Wrong matches of a map of 0.3 m: some fits leave errors that no number holds."""
-    camera = rsl.Camera(640, 480, [[500, 0, 319.5], [0, 500, 239.5], [0, 0, 1]], readout_time=0.03)
-    localizer, random = rsl.Localizer(camera, map_deviation=0.3), np.random.default_rng(3)
+    localizer, random = rsl.Localizer(pinhole(), map_deviation=0.3), np.random.default_rng(3)
     wall = np.column_stack([random.uniform(-3.0, 3.0, (400, 2)), np.full(400, 3.0)])
     for _ in range(24):
         matches = wall[random.integers(0, 400, 100)] + 0.3 * random.normal(size=(100, 3))
-        result = localizer.localize(matches, random.uniform(0.0, [639.0, 479.0], (100, 2)))
-        assert not result
+        assert not localizer.localize(matches, random.uniform(0.0, [639.0, 479.0], (100, 2)))
 
 
 def test_points_that_fit_by_chance_claim_no_more_than_where_they_are():
     """Some of 18 points that are off by up to 15 px fit a motion: none is published as certain."""
-    random, inside = np.random.default_rng(8), []
-    for _ in range(12):
-        camera, points, pixels, rotation = frame("volume", "right", random)
-        points, pixels = points[:18], pixels[:18] + random.uniform(-15.0, 15.0, (18, 2))
-        result = rsl.Localizer(camera).localize(points, pixels)
-        if result:
-            off = Rotation.from_matrix(result.rotation @ rotation.T).as_rotvec()
-            inside.append(off @ np.linalg.solve(result.covariance[:3, :3], off) < 16.0)
+    inside = []
+    for camera, points, pixels, rotation, random in frames("volume", count=12, seed=8):
+        noisy = pixels[:18] + random.uniform(-15.0, 15.0, (18, 2))
+        if result := rsl.Localizer(camera).localize(points[:18], noisy):
+            inside.append(turned(result, rotation) < FAR_3)
     assert len(inside) > 1
     assert all(inside)
 
 
 def test_a_moved_corner_is_a_notice():
-    camera, points, pixels, rotation = frame("volume", "right", np.random.default_rng(2))
+    ((camera, points, pixels, rotation, _),) = frames("volume", count=1, seed=2)
     moved = np.argsort(points[:, 0])[: len(points) // 4]
     points[moved] += (0.0, 0.5, 0.0)
     result = rsl.Localizer(camera).localize(points, pixels)
@@ -191,8 +181,7 @@ def test_a_moved_corner_is_a_notice():
     assert np.abs(result.rotation - rotation).max() < 0.01
     # Or the room was moved, and not the corner: with the share of that, the camera is half a metre
     # away.
-    along = result.rotation @ (0.0, 1.0, 0.0)
-    share = len(moved) / len(points)
+    along, share = result.rotation @ (0.0, 1.0, 0.0), len(moved) / len(points)
     deviation = np.sqrt(along @ result.covariance[3:6, 3:6] @ along)
     assert deviation == pytest.approx(0.5 * np.sqrt(share), rel=0.15)
 
@@ -203,8 +192,7 @@ def test_a_moved_corner_is_a_notice():
 )
 def test_two_fifths_of_the_matches_that_are_shifted_alike_are_left_out(shift, seed):
     """Scored at four thresholds, a motion between both groups is the best one by 8 px."""
-    random = np.random.default_rng(seed)
-    camera, points, pixels, rotation = frame("volume", "right", random)
+    ((camera, points, pixels, rotation, random),) = frames("volume", count=1, seed=seed)
     some = random.permutation(len(points))[: 2 * len(points) // 5]
     pixels[some] += (shift, 0.0)
     result = rsl.Localizer(camera).localize(points, pixels)
@@ -213,29 +201,25 @@ def test_two_fifths_of_the_matches_that_are_shifted_alike_are_left_out(shift, se
     assert np.abs(result.rotation - rotation).max() < 0.01
 
 
-def test_a_fast_camera_may_leave_out_a_few_points_that_lie_near():
+@pytest.mark.parametrize("speed", [5.0, 15.0])
+def test_a_fast_camera_may_leave_out_a_few_points_that_lie_near(speed):
     """As a phone in a car, whose matches come from tracks."""
-    random = np.random.default_rng(3)
-    for speed in (5.0, 15.0):
-        velocity = 0.02 * np.array([speed, 0.0, 0.0])
-        camera = rsl.Camera(640, 480, [[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]],
-                            readout_time=0.02)  # fmt: skip
-        points = random.uniform((-9.0, -7.0, 15.0), (9.0, 7.0, 25.0), (300, 3))
-        truth = rsl.Motion(np.eye(3), np.zeros(3), np.zeros(3), velocity)
-        pixels, _ = project_rolling(camera, truth.at_rows, points)
-        seen = camera.inside(pixels)
-        points, pixels = points[seen], pixels[seen] + random.normal(0.0, 0.3, (seen.sum(), 2))
-        pixels[::15] += random.uniform(-30.0, 30.0, (len(pixels[::15]), 2))
-        assert rsl.Localizer(camera).localize(points, pixels)
+    random, camera = np.random.default_rng(3), pinhole(readout_time=0.02)
+    points = random.uniform((-9.0, -7.0, 15.0), (9.0, 7.0, 25.0), (300, 3))
+    truth = replace(AT_REST, linear_velocity=0.02 * np.array([speed, 0.0, 0.0]))
+    pixels, _ = project_rolling(camera, truth.at_rows, points)
+    seen = camera.inside(pixels)
+    points, pixels = points[seen], pixels[seen] + random.normal(0.0, 0.3, (seen.sum(), 2))
+    pixels[::15] += random.uniform(-30.0, 30.0, (len(pixels[::15]), 2))
+    assert rsl.Localizer(camera).localize(points, pixels)
 
 
 @pytest.mark.parametrize("order", [[1, 2, 3, 0], [2, 3, 0, 1]])
 @pytest.mark.parametrize("seed", [5, 6, 7])
 def test_corners_of_markers_in_another_order_have_no_pose(order, seed):
     """Nobody says which points are a marker's: four in a row that are a square."""
-    random, said = np.random.default_rng(seed), []
-    for _ in range(8):
-        camera, points, pixels, _ = frame("markers", "right", random)
+    said = []
+    for camera, points, pixels, *_ in frames("markers", count=8, seed=seed):
         if len(points) == 40:  # all of each marker
             turned = pixels.reshape(-1, 4, 2)[:, order].reshape(-1, 2)
             result = rsl.Localizer(camera).localize(points, turned)
@@ -252,9 +236,8 @@ def test_a_marker_that_was_moved_does_not_make_the_camera_another_one(seed, mark
     places = np.array([(x, y, 0.0) for x in (-0.8, 0.0, 0.8) for y in (-0.45, 0.45)])[:markers]
     tilt = Rotation.from_rotvec(rng.uniform(-0.5, 0.5, 3) * [1, 1, 0])
     points = tilt.apply((places[:, None] + square).reshape(-1, 3)) + np.array([0.0, 0.0, 2.2])
-    pixels = 500.0 * points[:, :2] / points[:, 2:] + [319.5, 239.5]
+    pixels = 500.0 * points[:, :2] / points[:, 2:] + CENTRE
     pixels += rng.normal(0.0, 0.3, pixels.shape)
     points[4:8] += 0.1 * rng.normal(size=3)
-    camera = rsl.Camera(640, 480, [[500, 0, 319.5], [0, 500, 239.5], [0, 0, 1]], readout_time=0.03)
-    result = rsl.Localizer(camera).localize(points, pixels)
+    result = rsl.Localizer(pinhole()).localize(points, pixels)
     assert result or result.reason is Reason.UNCERTAIN, result

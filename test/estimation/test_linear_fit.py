@@ -43,14 +43,16 @@ SIZES = np.linspace(-2.5, 5.5, 11)  # as the module has them
 TERMS = terms_at(PRIOR, 0.1, False)
 
 
+def linearized_frame(seed, noise, count):
+    """Observations, their linearization without any vibration, and the true state."""
+    observations, truth = frame(seed, 0.05, noise, count)
+    return observations, linearized(observations.packed, count, truth, np.zeros((count, 6))), truth
+
+
 def everything(bent):
-    observations, truth = frame(3, 0.05, NOISE, count=30)
-    chosen = np.ones(30, bool)
-    chosen[[4, 17]] = False
-    lines = linearized(observations.packed, 30, truth, np.zeros((30, 6)))
-    bend = np.zeros((30, 0))
-    if bent:
-        bend = bend_of(observations.points, chosen, 4.0 / 590.0)
+    observations, lines, truth = linearized_frame(3, NOISE, 30)
+    chosen = ~np.isin(np.arange(30), [4, 17])
+    bend = bend_of(observations.points, chosen, 4.0 / 590.0) if bent else np.zeros((30, 0))
     shared = smooth_error(lines, chosen, bend, 0.2)
     columns = smooth_columns(lines.by_motion[chosen], lines.image[chosen], bend[chosen])
     return truth, chosen, lines, shared, columns.reshape(56, -1)
@@ -66,30 +68,26 @@ def test_sizes_are_integrated_as_over_dense_matrices(bent):
     dense, errors = lines.by_motion[chosen].reshape(56, 18), lines.errors[chosen].ravel()
     information, slope = known.form[:-1, :-1], known.form[:-1, -1]
     logs, steps, covariances = [], [], []
+
+    def at(shared_noise, deviation):
+        """Logarithm, step, covariance, and the noise that is left."""
+        whole = shared_noise + deviation**2 * np.eye(56)
+        inverse = np.linalg.inv(whole)
+        of_step = dense.T @ inverse @ dense + information
+        pull = dense.T @ inverse @ errors + slope
+        step = -np.linalg.solve(of_step, pull)
+        rest = deviation**2 * inverse @ (errors + dense @ step)
+        cost = errors @ inverse @ errors + known.form[-1, -1] + step @ pull
+        cost += np.linalg.slogdet(2.0 * np.pi * whole)[1] + np.linalg.slogdet(of_step)[1]
+        taken = 56.0 - deviation**2 * np.trace(inverse)
+        left = np.sqrt(rest @ rest / max(56.0 - 12.0 - taken, 5.6))
+        return -0.5 * cost, step, np.linalg.inv(of_step), np.clip(left, 0.16 * NOISE, 1.3 * NOISE)
+
+    deviation = None
     for away in SIZES:
         shared_noise = 0.2**2 * np.exp(2.0 * away) * columns @ columns.T
-
-        def at(deviation, shared_noise=shared_noise):
-            whole = shared_noise + deviation**2 * np.eye(56)
-            inverse = np.linalg.inv(whole)
-            of_step = dense.T @ inverse @ dense + information
-            step = -np.linalg.solve(of_step, dense.T @ inverse @ errors + slope)
-            moved = errors + dense @ step
-            rest = deviation**2 * inverse @ moved
-            own = np.linalg.inv(of_step)
-            cost = errors @ inverse @ errors + known.form[-1, -1]
-            cost += step @ (dense.T @ inverse @ errors + slope)
-            log = -0.5 * (
-                cost + np.linalg.slogdet(2.0 * np.pi * whole)[1] + np.linalg.slogdet(of_step)[1]
-            )
-            taken = 56.0 - deviation**2 * np.trace(inverse)
-            left = rest @ rest / max(56.0 - 12.0 - taken, 5.6)
-            usual = NOISE * np.array([0.16, 1.3])
-            return log, step, own, np.clip(np.sqrt(left), *usual)
-
-        if not logs:
-            deviation_here = at(NOISE)[3]
-        log, step, covariance, deviation_here = at(deviation_here)
+        deviation = deviation or at(shared_noise, NOISE)[3]
+        log, step, covariance, deviation = at(shared_noise, deviation)
         logs.append(log - 0.5 * away**2)
         steps.append(step)
         covariances.append(covariance)
@@ -105,17 +103,17 @@ def test_sizes_are_integrated_as_over_dense_matrices(bent):
     assert found.size == pytest.approx(np.sqrt(weights @ sizes**2), rel=0.05)
 
 
-def test_odds_are_probabilities():
-    assert logsumexp(VIBRATION.odds) == pytest.approx(0.0, abs=1e-12)
-
-
 def shaking():
-    """Points of a camera that is linearized without its vibration, whole waves as columns, and the
-    fit's equations, in which points share no error.
+    """Truth and linearization of a camera that may shake, and the equations of its fit, in which
+    points share no error.
     """
-    observations, truth = frame(5, 0.05, 0.5, count=40)
-    lines = linearized(observations.packed, 40, truth, np.zeros((40, 6)))
-    dense = lines.by_motion.reshape(80, 18)
+    _, lines, truth = linearized_frame(5, 0.5, 40)
+    shared = nothing_shared(40)
+    return truth, lines, shared, linear_of(lines, np.ones(40, bool), True, shared.rows)
+
+
+def whole_waves(lines):
+    """Columns (80,84) of cosines and sines beside a motion, and what they add to it (18,84)."""
     angles = 2.0 * np.pi * np.outer(lines.tau, CYCLES)
     waves = np.stack([np.cos(angles) - 1.0, np.sin(angles) - angles], 2).reshape(40, -1)
     middle = np.zeros((18, 28, 3))
@@ -124,14 +122,13 @@ def shaking():
         middle[6 + axis, 1::2, axis] = 2.0 * np.pi * CYCLES
     middle = middle.reshape(18, -1)
     turns = (lines.by_turn[:, :, None, :] * waves[:, None, :, None]).reshape(80, -1)
-    shared = nothing_shared(40)
-    linear = linear_of(lines, np.ones(40, bool), True, shared.rows)
-    return truth, lines, dense, turns + dense @ middle, middle, shared, linear
+    return turns + lines.by_motion.reshape(80, 18) @ middle, middle
 
 
 def test_vibration_is_integrated_as_over_dense_matrices():
     """Whole cosines and sines beside a motion of which a prior knows something, at one noise."""
-    truth, lines, dense, turns, middle, shared, linear = shaking()
+    truth, lines, shared, linear = shaking()
+    dense, (turns, middle) = lines.by_motion.reshape(80, 18), whole_waves(lines)
     information, slope = np.zeros((18, 18)), np.zeros(18)
     prior_cost = add_prior(PRIOR, truth, 1.0, information, slope)
     errors = lines.errors.ravel()
@@ -144,18 +141,12 @@ def test_vibration_is_integrated_as_over_dense_matrices():
     near *= np.sqrt(np.sum(TYPICAL_SIZES**2) / np.sum(near**2, axis=1, keepdims=True))
     axes = [np.array([0.1, 0.1, 1.0])] * 2 + [np.ones(3)] * 5  # the first: about the optical axis
     shapes = zip((*near, TYPICAL_SIZES), axes, strict=True)
-    every = [
-        factor * np.outer(np.repeat(of, 2), axis).ravel()
-        for of, axis in shapes
-        for factor in FACTORS
-    ]
+    sizes_of = [np.outer(np.repeat(of, 2), axis).ravel() for of, axis in shapes]
+    every = [factor * sizes for sizes in sizes_of for factor in FACTORS]
     prior = np.tile(-0.5 * (np.log(FACTORS) / np.log(10.0)) ** 2, 7)
     prior[: 2 * len(FACTORS)] -= 4.0
     prior -= logsumexp(prior)
-    rest = noise**2 * (
-        errors @ errors / noise**2 + prior_cost
-        + first @ (dense.T @ errors / noise**2 + slope)
-    )  # fmt: skip
+    rest = errors @ errors + noise**2 * (prior_cost + first @ slope) + first @ dense.T @ errors
     for sizes, before in zip(every, prior, strict=True):
         columns = turns * sizes
         beside = columns.T @ columns / noise**2
@@ -181,14 +172,12 @@ def test_vibration_is_integrated_as_over_dense_matrices():
     whole = np.hstack([np.eye(18), MIDDLE])
     ratio = (found.noise / noise) ** 2
     shown = whole @ found.covariance @ whole.T - ratio * np.linalg.inv(white)
-    moved = whole @ found.step - first
-    shown += np.outer(moved, moved)
+    shown += np.outer(whole @ found.step - first, whole @ found.step - first)
     # Pose and velocities; what truncated combinations lose of accelerations is not asked for.
     poses = expected[:12, :12]
     alike(shown[:12, :12], poses, np.sqrt(np.diag(poses)), atol=0.05)
-    gain, hiding, _ = hidden(
-        lines, np.ones(40, bool), shared, known, noise, freedom, math.inf, VIBRATION
-    )
+    every_point = np.ones(40, bool)
+    gain, hiding, _ = hidden(lines, every_point, shared, known, noise, freedom, math.inf, VIBRATION)
     assert gain == pytest.approx(found.gain, abs=1e-9)
     alike(hiding, shown[:12, :12], np.sqrt(np.diag(poses)), atol=1e-6)
 
@@ -197,23 +186,18 @@ def test_vibration_is_integrated_as_over_dense_matrices():
 def test_a_block_that_is_dropped_by_name_leaves_the_fit_without_it(name):
     truth, chosen, lines, shared, _ = everything(False)
     known, noise = known_at(TERMS, truth), Noise(NOISE, 1.0, 12.0)
-    both = linear_of(lines, chosen, True, shared.rows)
-    if name == "turn":
-        dropped = fit(without(both, name), shared, known, noise, NO_TURN, True)
-        never = linear_of(lines, chosen, False, shared.rows)
-        expected = fit(never, shared, known, noise, NO_TURN, True)
-    else:
-        nothing = nothing_shared(28)
-        dropped = fit(without(both, name), nothing, known, noise, VIBRATION, True)
-        never = linear_of(lines, chosen, True, nothing.rows)
-        expected = fit(never, nothing, known, noise, VIBRATION, True)
+    both, nothing = linear_of(lines, chosen, True, shared.rows), nothing_shared(28)
+    left, turn = (shared, NO_TURN) if name == "turn" else (nothing, VIBRATION)
+    dropped = fit(without(both, name), left, known, noise, turn, True)
+    never = linear_of(lines, chosen, name != "turn", left.rows)
+    expected = fit(never, left, known, noise, turn, True)
     agree(dropped.step, dropped.covariance, expected.step, expected.covariance, atol=1e-12)
     assert dropped.evidence == pytest.approx(expected.evidence, abs=1e-9)
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.1, 0.3])
 def test_another_prior_of_the_motion_makes_the_fit_that_it_would_have_made(speed):
-    truth, *_, shared, linear = shaking()
+    truth, _, shared, linear = shaking()
     still = truth.copy()
     still[12:] = 0.0
     linear = moved(linear, np.append(np.zeros(6), np.append(-truth[12:], np.zeros(TURNS))))
@@ -234,7 +218,7 @@ def test_another_prior_of_the_motion_makes_the_fit_that_it_would_have_made(speed
 
 def test_a_gyroscope_enters_as_mean_and_covariance_of_the_turn_and_what_couples_it():
     """One Gaussian of all 72 unknowns, beside a motion's own prior: one dense solution."""
-    truth, *_, shared, linear = shaking()
+    truth, _, shared, linear = shaking()
     rng, known = np.random.default_rng(7), known_at(PRIOR, truth)
     mean, factor = np.append(np.zeros(18), 1e-3 * rng.normal(size=TURNS)), np.zeros((72, 72))
     factor[6:9], factor[18:] = rng.normal(size=(3, 72)), rng.normal(size=(54, 72))
@@ -243,10 +227,8 @@ def test_a_gyroscope_enters_as_mean_and_covariance_of_the_turn_and_what_couples_
     form[:72, :72] = told
     form[18:72, 18:72] = 0.0
     form[np.ix_(place, place)] += known.form
-    beside, prior = (
-        known._replace(form=form),
-        TurnPrior.of(told[None, 18:, 18:].copy(), np.zeros(1)),
-    )
+    beside = known._replace(form=form)
+    prior = TurnPrior.of(told[None, 18:, 18:].copy(), np.zeros(1))
     found = fit(moved(linear, mean), shared, beside, Noise(0.5, 1.0, 18.0), prior, True)
     information, slope = linear.every[:72, :72] / 0.25 + told, linear.every[:72, 72] / 0.25
     slope -= told @ mean
@@ -262,7 +244,7 @@ def test_a_gyroscope_enters_as_mean_and_covariance_of_the_turn_and_what_couples_
 @pytest.mark.parametrize("noise", [1e-9, 1e-3, 1e6])
 @pytest.mark.parametrize("size", [0.0, 1e-200, 1e-9, 1e9, 1e150])
 def test_no_size_of_errors_is_an_exception(noise, size):
-    truth, lines, *_, shared, _ = shaking()
+    truth, lines, shared, _ = shaking()
     known = known_at(PRIOR, truth)
     far = lines._replace(errors=size * lines.errors)
     linear = linear_of(far, np.ones(40, bool), True, shared.rows)
@@ -272,19 +254,20 @@ def test_no_size_of_errors_is_an_exception(noise, size):
 
 def test_noise_that_is_not_expected_speaks_for_vibration():
     """By a half-normal prior of noise: the more, the more of its variance the vibration takes."""
-    truth, *_, shared, linear = shaking()
+    truth, _, shared, linear = shaking()
     known, one = known_at(PRIOR, truth), TurnPrior.of(VIBRATION.informations[3:4], np.zeros(1))
-    gains = {}
-    for expected in (math.inf, 1.0, 0.1, 0.01):
-        found = fit(linear, shared, known, Noise(0.3, 1.0, 18.0, expected), one, True)
-        gains[expected] = found.gain
+
+    def fitted(equations, expected):
+        return fit(equations, shared, known, Noise(0.3, 1.0, 18.0, expected), one, True)
+
+    found = fitted(linear, math.inf)
     still = Linear(linear.every.copy(), linear.beside.copy())
     still.every[18:72] = still.every[:, 18:72] = 0.0  # nothing of it shows
-    nothing = fit(still, shared, known, Noise(0.3, 1.0, 18.0), one, True)
-    taken = nothing.noise**2 - found.noise**2
+    taken = fitted(still, math.inf).noise ** 2 - found.noise**2
     assert taken > 0.0
     for expected in (1.0, 0.1, 0.01):
-        assert gains[expected] - gains[math.inf] == pytest.approx(0.5 * taken / expected**2)
+        gain = fitted(linear, expected).gain - found.gain
+        assert gain == pytest.approx(0.5 * taken / expected**2)
 
 
 def test_products_farther_along_the_tangent_leave_the_same_optimum():
@@ -293,12 +276,10 @@ def test_products_farther_along_the_tangent_leave_the_same_optimum():
     known = known_at(TERMS, truth)
     at_once = fit(linear, shared.at(0.2), known, noise, NO_TURN, True)
     step = 1e-3 * np.random.default_rng(0).normal(size=18)
-    by = np.eye(19)
-    by[:18, 18] = step
+    by = np.eye(19) + np.outer(np.append(step, 0.0), np.eye(19)[18])
     there = known._replace(form=by.T @ known.form @ by)
     farther = fit(moved(linear, step), shared.at(0.2), there, noise, NO_TURN, True)
-    deviations = np.sqrt(np.diag(at_once.covariance))
-    np.testing.assert_allclose((farther.step + step - at_once.step) / deviations, 0.0, atol=1e-8)
+    alike(farther.step + step, at_once.step, np.sqrt(np.diag(at_once.covariance)), atol=1e-8)
     assert farther.evidence == pytest.approx(at_once.evidence, abs=1e-8)
 
 
@@ -317,7 +298,6 @@ def test_combinations_of_columns_are_orthonormal_and_say_the_same(bent):
 
 def test_a_smooth_error_of_one_pixel_has_a_mean_square_of_one():
     """Over the image of a scene without depth, of u and of v."""
-    observations, truth = frame(5, 0.0, 0.0, count=2000)
-    lines = linearized(observations.packed, 2000, truth, np.zeros((2000, 6)))
+    _, lines, _ = linearized_frame(5, 0.0, 2000)
     shared = smooth_error(lines, np.ones(2000, bool), np.zeros((2000, 0)), 1.0)
     assert 0.5 < np.sum(shared.squares) / 4000 < 2.0

@@ -15,7 +15,7 @@ from rs_localizer.estimation.robust import (
     solve_positive,
 )
 
-from .frames import changed, fitted, frame
+from .frames import changed, differences, fitted, frame
 from .projection import disturbed
 
 NO_PRIOR = motion_terms((0.0, 0.0), (0.0, 0.0))
@@ -48,24 +48,19 @@ def test_the_minimum_has_no_slope_of_the_posterior():
     observations, truth = frame(0, 0.1, 0.5, count=30)
     # Without the row's part the cost is exactly that of the residuals.
     data = changed(observations, gradient=np.zeros(2)).packed
-    prior, noise, h = motion_terms((0.2, 0.1), (0.1, 0.05)), 0.5, 1e-6
+    prior, noise = motion_terms((0.2, 0.1), (0.1, 0.05)), 0.5
     precisions = np.repeat([25.0, 100.0, 100.0, 400.0], 3)
     state = refine(data, truth, (1e3, 0.0), prior, noise, 2, 50, 1e-6)[0]
 
-    def posterior(s):
-        changes = s[12:]
-        errors = squared_errors(data, observations.count, s)
-        return errors.sum() + noise**2 * changes @ (precisions * changes)
+    def posterior(step):
+        there = apply_step(state, step)
+        errors = squared_errors(data, observations.count, there)
+        return errors.sum() + noise**2 * there[12:] @ (precisions * there[12:])
 
-    for e in np.eye(18):
-        slope = (posterior(apply_step(state, h * e)) - posterior(apply_step(state, -h * e))) / (
-            2 * h
-        )
-        curvature = (
-            posterior(apply_step(state, 1e-4 * e)) + posterior(apply_step(state, -1e-4 * e))
-            - 2 * posterior(state)
-        ) / 1e-8  # fmt: skip
-        assert abs(slope) < 1e-3 * np.sqrt(curvature) * noise
+    slope = differences(posterior, 18, 1e-6)
+    near = [posterior(e) + posterior(-e) for e in 1e-4 * np.eye(18)]
+    curvature = (np.array(near) - 2 * posterior(np.zeros(18))) / 1e-8
+    assert np.all(np.abs(slope) < 1e-3 * np.sqrt(curvature) * noise)
 
 
 def test_a_matrix_that_is_not_positive_is_refused():
@@ -109,16 +104,11 @@ def test_noise_counts_the_degrees_of_freedom_and_never_divides_by_none():
     assert noise_deviation(strewn, 2.0, 0.0) > 1.9
 
 
-def information(seed=0, points=1.0):
-    factor = np.random.default_rng(seed).normal(size=(18, 40))
-    return points * factor @ factor.T
-
-
 def test_points_decide_what_the_prior_leaves_to_them(as_python):
     share_of = as_python(decided)
-    noise, of_points = 0.5, information()
-    nothing = motion_terms((0.0, 0.0), (0.0, 0.0))
-    assert share_of(inverted(of_points), nothing, noise) == pytest.approx(18.0)
+    factor = np.random.default_rng(0).normal(size=(18, 40))
+    noise, of_points = 0.5, factor @ factor.T
+    assert share_of(inverted(of_points), NO_PRIOR, noise) == pytest.approx(18.0)
     held = of_points + noise**2 * held_terms().informations[0]
     assert share_of(inverted(held), held_terms(), noise) == pytest.approx(6.0)
     both = of_points + noise**2 * PRIOR.informations[0]
@@ -126,7 +116,7 @@ def test_points_decide_what_the_prior_leaves_to_them(as_python):
     share = np.trace(np.linalg.solve(both, of_points))
     assert 6.0 < share < 18.0
     assert share_of(inverted(both), PRIOR, noise) == pytest.approx(share)
-    weak = information(points=1e-9) + noise**2 * PRIOR.informations[0]
+    weak = 1e-9 * of_points + noise**2 * PRIOR.informations[0]
     assert share_of(inverted(weak), PRIOR, noise) == pytest.approx(6.0, abs=1e-3)
 
 

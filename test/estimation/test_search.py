@@ -7,17 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rs_localizer.estimation import search
 from rs_localizer.estimation.prior import motion_terms
-from rs_localizer.estimation.search import (
-    NOTHING,
-    Draws,
-    Hypotheses,
-    Pool,
-    draw,
-    generator,
-    search,
-    state_of_model,
-)
 from rs_localizer.solvers.table import find_solver
 
 from .frames import changed, frame
@@ -54,10 +45,10 @@ def problem(outlier_share):
 def run(observations, solver, *pools):
     """The search by pools of equal shares."""
     mock = replace(find_solver("r6p_vcwt"), solve=solver)
-    hypotheses = Hypotheses(mock, 50, 8.0, 2.0, 1.0, 5)
-    shares = [Pool.of(points, ROWS, 1.0, 0) for points in pools]
-    draws = Draws(np.eye(3), shares, 0.99, 2000, generator(1))
-    return search(observations, hypotheses, FREE, draws, NOTHING)
+    hypotheses = search.Hypotheses(mock, 50, 8.0, 2.0, 1.0, 5)
+    shares = [search.Pool.of(points, ROWS, 1.0, 0) for points in pools]
+    draws = search.Draws(np.eye(3), shares, 0.99, 2000, search.generator(1))
+    return search.search(observations, hypotheses, FREE, draws, search.NOTHING)
 
 
 EVERYTHING = np.arange(100)
@@ -86,11 +77,13 @@ def test_good_pools_stop_the_search_early_and_all_are_drawn_from():
 
 @pytest.fixture(scope="session")
 def samples_of(as_python):
-    drawn = as_python(draw)
+    drawn = as_python(search.draw)
 
     def samples_of(pool, count, size, tau):
         samples = np.full((count, size), -1)
-        drawn(Pool.of(pool, float(np.ptp(tau)), 1.0, 0), 0, tau, generator(0), samples)
+        drawn(
+            search.Pool.of(pool, float(np.ptp(tau)), 1.0, 0), 0, tau, search.generator(0), samples
+        )
         return samples
 
     return samples_of
@@ -109,16 +102,8 @@ def test_all_points_are_drawn_equally_often(samples_of):
 def test_samples_spread_over_the_rows_where_they_can(samples_of):
     tau = np.concatenate([np.full(90, 0.1), np.linspace(-0.5, 0.5, 10)])
     spread = np.ptp(tau[samples_of(np.arange(100), 1000, 6, tau)], axis=1)
-    without = np.ptp(
-        tau[np.array([np.random.default_rng(k).choice(100, 6, False) for k in range(1000)])], axis=1
-    )
+    anywhere = np.array([np.random.default_rng(k).choice(100, 6, False) for k in range(1000)])
+    without = np.ptp(tau[anywhere], axis=1)
     assert np.mean(spread < 0.25) < 0.2 * np.mean(without < 0.25)
     # Where all rows are the same, samples come nevertheless.
     assert (samples_of(np.arange(10), 5, 6, np.zeros(10)) >= 0).all()
-
-
-def test_models_become_states_by_the_motion_model(as_python):
-    model = np.random.default_rng(0).normal(size=18)
-    c, w, drift = model[9:12], model[12:15], model[15:18]
-    expected = np.concatenate([model[:12], -w, np.cross(w, c) - drift, np.zeros(6)])
-    np.testing.assert_allclose(as_python(state_of_model)(model), expected, atol=1e-15)
