@@ -139,6 +139,15 @@ def error_of(found: Any, truth: rsl.Motion) -> np.ndarray:
     ])  # fmt: skip
 
 
+def estimate_at(motion: rsl.Motion = AT_REST, count: int = 5, **more: Any) -> rsl.Estimate:
+    """A frame's estimate of this motion, whose points are all inliers; or with other fields."""
+    names = ("rotation", "translation", "angular_velocity", "linear_velocity",
+             "angular_acceleration", "linear_acceleration")  # fmt: skip
+    usual = {"inliers": np.ones(count, bool), "residuals": np.zeros(count),
+             "joint_covariance": 1e-4 * np.eye(18), "iterations": 0}  # fmt: skip
+    return rsl.Estimate(**{name: getattr(motion, name) for name in names} | usual | more)
+
+
 def squared(error: np.ndarray, covariance: np.ndarray) -> float:
     """Squared length of an error (n,) in deviations, by the first n of a covariance."""
     known = covariance[: len(error), : len(error)]

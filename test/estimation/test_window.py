@@ -6,21 +6,15 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-import rs_localizer as rsl
 from rs_localizer.config import Acceleration
+from rs_localizer.core.shutter import motion_of
 from rs_localizer.core.state import step_between
-from rs_localizer.core.types import Estimate
 from rs_localizer.estimation import window as window_module
 from rs_localizer.estimation.prior import Prior, motion_terms, with_motion
 from rs_localizer.estimation.robust import apply_step
-from rs_localizer.estimation.window import (
-    LENGTH,
-    Gaussian,
-    MotionSample,
-    MotionWindow,
-    told_of,
-)
+from rs_localizer.estimation.window import Gaussian, MotionSample, MotionWindow, told_of
 
+from ..moving import AT_REST, estimate_at, squared  # noqa: TID252 - Python has a package "test"
 from .frames import alike
 
 FADING, PERIOD = 0.03, 1.0 / 30.0  # s
@@ -35,27 +29,16 @@ SEEN = np.diag(np.concatenate([NOISE**-2.0, np.zeros(6)]))
 WIDE = np.diag((SMALL * np.repeat([0.1, 0.1, 1.0, 1.0, 10.0, 4.0], 3)) ** 2)
 
 
-def dynamics():
-    """Of way, velocity and acceleration over a period: transition, and noise of a unit."""
-    matrix = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0 / FADING]])
-    steps = 400
-    noise, dt = np.zeros((3, 3)), PERIOD / steps
-    for k in range(steps):
-        reached = expm((k + 0.5) * dt * matrix)[:, 2]
-        noise += dt * 2.0 / FADING * np.outer(reached, reached)
-    return expm(PERIOD * matrix), noise
+# Of way, velocity and acceleration over a period: transition, and noise of a unit.
+DYNAMICS = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0 / FADING]])
+STEP = expm(PERIOD * DYNAMICS)
+REACHED = np.array([expm((k + 0.5) * PERIOD / 400 * DYNAMICS)[:, 2] for k in range(400)])
+UNIT_NOISE = PERIOD / 400 * 2.0 / FADING * REACHED.T @ REACHED
 
 
-STEP, UNIT_NOISE = dynamics()
-
-
-def whole(blocks):
-    """(18,18) of six axes' blocks (3,3): way, velocity, acceleration of turn and place."""
-    result = np.zeros((18, 18))
-    for axis, block in enumerate(blocks):
-        own = np.array([axis, axis + 6, axis + 12])
-        result[np.ix_(own, own)] = block
-    return result
+def whole(block, sizes=(1.0,) * 6):
+    """(18,18) of a block (3,3) for each axis: way, velocity, acceleration of turn and place."""
+    return np.kron(block, np.diag(np.square(sizes)))
 
 
 def simulated(deviations, count, rng, state=None):
@@ -75,19 +58,15 @@ def samples_of(path, rng, first=0):
     """What frames see of it."""
     found = []
     for k, truth in enumerate(path):
-        seen = truth + np.concatenate([NOISE * rng.normal(size=12), np.zeros(6)])
-        seen[12:] = 0.0
+        seen = np.append(truth[:12] + NOISE * rng.normal(size=12), np.zeros(6))
         time_ns = round(1e9 * PERIOD * (first + k + 1))
         found.append(MotionSample(time_ns, apply_step(STILL, seen), SEEN, np.zeros(18)))
     return found
 
 
-def start():
-    return Gaussian(0, STILL, WIDE)
-
-
 def through(samples, window=None):
-    window = window or MotionWindow.begin(start(), Acceleration(HAND[0], HAND[3]))
+    began = Gaussian(0, STILL, WIDE)
+    window = window or MotionWindow.begin(began, Acceleration(HAND[0], HAND[3]))
     for sample in samples:
         window = window.joined(sample)
     return window
@@ -95,24 +74,19 @@ def through(samples, window=None):
 
 def dense(samples, deviations):
     """All motions at once by least squares: means (n + 1,18) and covariances (n + 1,18,18)."""
-    n = len(samples)
-    size = 18 * (n + 1)
-    information, right = np.zeros((size, size)), np.zeros(size)
-    information[:18, :18] += np.linalg.inv(WIDE)
-    move = whole([STEP] * 6)
-    inverse = np.linalg.inv(whole([d**2 * UNIT_NOISE for d in deviations]))
+    n, move = len(samples) + 1, whole(STEP)
+    information, right = np.zeros((n, 18, n, 18)), np.zeros((n, 18))
+    information[0, :, 0] += np.linalg.inv(WIDE)
+    inverse = np.linalg.inv(whole(UNIT_NOISE, deviations))
     for k, sample in enumerate(samples):
-        rows = np.zeros((18, size))
-        rows[:, 18 * k : 18 * k + 18] = -move
-        rows[:, 18 * k + 18 : 18 * k + 36] = np.eye(18)
-        information += rows.T @ inverse @ rows
-        own = slice(18 * k + 18, 18 * k + 36)
-        information[own, own] += sample.information
-        right[own] += sample.information @ step_between(STILL, sample.state)
-    covariance = np.linalg.inv(information)
-    return (covariance @ right).reshape(n + 1, 18), [
-        covariance[18 * k : 18 * k + 18, 18 * k : 18 * k + 18] for k in range(n + 1)
-    ]
+        information[k, :, k] += move.T @ inverse @ move
+        information[k, :, k + 1] -= move.T @ inverse
+        information[k + 1, :, k] -= inverse @ move
+        information[k + 1, :, k + 1] += inverse + sample.information
+        right[k + 1] = sample.information @ step_between(STILL, sample.state)
+    covariance = np.linalg.inv(information.reshape(18 * n, 18 * n))
+    means = (covariance @ right.ravel()).reshape(n, 18)
+    return means, [covariance.reshape(n, 18, n, 18)[k, :, k] for k in range(n)]
 
 
 @pytest.fixture
@@ -124,12 +98,12 @@ def as_learnt(monkeypatch):
 @pytest.mark.usefixtures("as_learnt")
 def test_it_is_least_squares_over_all_its_frames():
     rng = np.random.default_rng(0)
-    path, _ = simulated(0.1 * HAND, LENGTH - 1, rng)
+    path, _ = simulated(0.1 * HAND, window_module.LENGTH - 1, rng)
     samples = samples_of(path, rng)
     window = through(samples)
     means, covariances = dense(samples, np.repeat(window.deviations, (1, 1, 1, 3)))
     scale = np.sqrt(np.diag(covariances[-1]))
-    for k in range(LENGTH):
+    for k in range(window_module.LENGTH):
         found = window.before(len(samples) - k)
         alike(step_between(STILL, found.state), means[k], scale, atol=0.03)
         alike(found.covariance, covariances[k], scale, atol=0.01, rtol=0.01)
@@ -157,15 +131,15 @@ def test_scales_are_learnt_from_both_sides_within_a_few_frames(before, after, fr
 
 def test_deviations_hold_the_errors_of_every_lag():
     rng = np.random.default_rng(3)
-    squared = {0: [], 1: [], 2: []}
+    lengths = {0: [], 1: [], 2: []}
     for _ in range(60):
         path, _ = simulated(0.5 * HAND, 10, rng)
         window = through(samples_of(path, rng))
-        for lag, found in squared.items():
+        for lag, found in lengths.items():
             there = window.before(lag)
             off = step_between(there.state, apply_step(STILL, path[-1 - lag]))[:12]
-            found.append(off @ np.linalg.solve(there.covariance[:12, :12], off))
-    for lag, found in squared.items():
+            found.append(squared(off, there.covariance))
+    for lag, found in lengths.items():
         assert 0.85 < np.mean(np.array(found) < 21.03) <= 1.0, lag  # chi-squared of 12
         assert 8.0 < np.mean(found) < 18.0, lag
 
@@ -206,16 +180,6 @@ def test_between_two_frames_of_a_fast_camera_a_covariance_is_positive(seconds):
         assert np.linalg.eigvalsh(between / np.outer(scale, scale))[0] > 0.0
 
 
-def estimate(step, joint):
-    state = apply_step(STILL, step)
-    return Estimate(
-        state[:9].reshape(3, 3), state[9:12], state[12:15], state[15:18],
-        angular_acceleration=state[18:21], linear_acceleration=state[21:],
-        inliers=np.ones(5, bool), residuals=np.zeros(5), joint_covariance=joint,
-        iterations=0, span=SPAN,
-    )  # fmt: skip
-
-
 UNITS = np.repeat([1.0, 1.0, SPAN, SPAN, SPAN**2, SPAN**2], 3)  # per readout
 
 
@@ -227,16 +191,16 @@ def test_points_tell_what_the_posterior_knows_beside_its_prior():
     spread = 1e-4 * (root @ root.T + np.eye(18))
     known = with_motion(
         motion_terms((1.0, 1.0), (1.0, 1.0)),
-        Prior(motion=rsl.Motion(np.eye(3), *np.zeros((3, 3))), covariance=spread), np.zeros(3),
+        Prior(motion=AT_REST, covariance=spread), np.zeros(3),
     )  # fmt: skip
     before = np.linalg.inv(spread)
     before[6:12, 6:12] += np.eye(6)  # the velocities of the settings
     posterior = np.linalg.inv(information + before)
-    sample = told_of(estimate(posterior @ gradient, posterior), 7, known)
+    state = apply_step(STILL, posterior @ gradient)
+    motion = motion_of((state[:9].reshape(3, 3), *state[9:].reshape(5, 3)))
+    sample = told_of(estimate_at(motion, joint_covariance=posterior, span=SPAN), 7, known)
     scale = np.sqrt(np.diag(information + before))
     alike(sample.information / np.outer(UNITS, UNITS), information, scale, atol=2e-3)
     # The gradient at the estimate: the points pull as much as the prior holds.
     left = gradient - information @ (posterior @ gradient)
-    np.testing.assert_allclose(
-        sample.gradient / UNITS / scale, left / scale, atol=1e-2 * np.abs(left / scale).max()
-    )
+    alike(sample.gradient / UNITS, left, scale, atol=1e-2 * np.abs(left / scale).max())
