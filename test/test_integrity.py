@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The chance of a wrong pose or map rises by what only those leave, and falls again."""
 
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +13,11 @@ import pytest
 import rs_localizer as rsl
 from benchmarks.integrity import SCENES, recursive, sequence
 from rs_localizer.config import Acceleration
-from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.integrity import Integrity, SeenLandmarks
+
+from .moving import AT_REST, estimate_at
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 RNG = np.random.default_rng(0)
@@ -24,70 +27,58 @@ POINTS = RNG.uniform([-3.0, -3.0, 3.0], [3.0, 3.0, 9.0], (120, 3))
 
 def estimate(kept: Any, tracked: bool = True) -> Estimate:
     residuals = np.where(kept, np.abs(RNG.normal(0.0, 0.5, len(kept))), 9.0)
-    return Estimate(
-        rotation=np.eye(3), translation=np.zeros(3), angular_velocity=np.zeros(3),
-        linear_velocity=np.zeros(3), inliers=np.asarray(kept), residuals=residuals,
-        joint_covariance=1e-4 * np.eye(18), iterations=0, tracked=tracked,
-    )  # fmt: skip
+    return estimate_at(inliers=np.asarray(kept), residuals=residuals, tracked=tracked)
 
 
-def run(frames: int, kept: Any, prior: Prior | None = None) -> list[float]:
+def run(frames: Iterable[Any], jumps: tuple[int, ...] = (), unseen: float = FRAME) -> list[float]:
+    """Doubts after frames of which these points were kept; some are half a metre aside."""
     judge, doubts = Integrity(Acceleration()), []
-    for i in range(frames):
-        numbers = judge.numbers(estimate(kept(), i > 0), POINTS, prior, FRAME)
-        doubts.append(judge.add(numbers, FRAME))
+    for i, kept in enumerate(frames):
+        seconds, prior = unseen if i in jumps else FRAME, None
+        if jumps:
+            aside = [0.5 if i in jumps else 0.005, 0.0, 0.0]  # m, known to a centimetre
+            motion = replace(AT_REST, translation=np.array(aside))
+            prior = Prior(motion=motion, covariance=1e-4 * np.eye(12))
+        numbers = judge.numbers(estimate(kept, i > 0), POINTS, prior, seconds)
+        doubts.append(judge.add(numbers, seconds))
     return doubts
 
 
-def anywhere() -> Any:
-    return RNG.random(120) < 0.8
+def anywhere(count: int) -> Any:
+    return RNG.random((count, 120)) < 0.8
 
 
-def near() -> Any:
+def near(count: int) -> Any:
     """Only a quarter fits, about one place of the room: as a part of another room would."""
     far = np.linalg.norm(POINTS - POINTS[0], axis=1)
-    return far < np.quantile(far, 0.25)
+    return [far < np.quantile(far, 0.25)] * count
 
 
 def test_chance_outliers_are_no_doubt_and_a_part_that_fits_alone_is():
-    right, wrong = run(15, anywhere), run(15, near)
-    half = run(15, lambda: POINTS[:, 0] > 0.0)  # the other was moved: mostly, the pose is right
+    right, wrong = run(anywhere(15)), run(near(15))
+    half = run([POINTS[:, 0] > 0.0] * 15)  # the other was moved: mostly, the pose is right
     assert max(right[5:]) < 0.02
     assert min(half[3:]) > 3.0 * max(right[5:])
     assert max(half) < 0.5 < wrong[-1]
 
 
 def test_doubt_falls_again():
-    judge = Integrity(Acceleration())
-    doubts = [
-        judge.add(judge.numbers(estimate(kept), POINTS, None, FRAME), FRAME)
-        for kept in (*(near() for _ in range(10)), *(anywhere() for _ in range(15)))
-    ]
+    doubts = run([*near(10), *anywhere(15)])
     assert doubts[9] > 0.2
     assert doubts[-1] < 0.05
-    judge.reset()
-    assert judge.add(judge.numbers(estimate(anywhere()), POINTS, None, FRAME), FRAME) < 0.1
-
-
-def jumping(unseen: float) -> list[float]:
-    """Doubts of a track that jumps by half a metre twice, after so many seconds out of sight."""
-    judge, doubts = Integrity(Acceleration()), []
-    for i in range(40):
-        jumps = i in (10, 30)
-        aside = np.array([0.5 if jumps else 0.005, 0.0, 0.0])  # m, known to a centimetre
-        motion = Motion(np.eye(3), aside, np.zeros(3), np.zeros(3))
-        prior = Prior(motion=motion, covariance=1e-4 * np.eye(12))
-        seen = estimate(anywhere(), i > 0), POINTS, prior, unseen if jumps else FRAME
-        doubts.append(judge.add(judge.numbers(*seen), seen[-1]))
-    return doubts
 
 
 def test_a_pose_that_jumps_is_doubted_until_it_jumps_back():
-    doubts = jumping(FRAME)
+    doubts = run(anywhere(40), jumps=(10, 30))
     assert max(doubts[:10]) < 0.05
     assert min(doubts[10:30]) > 0.5  # a map that is wrong everywhere alike shows nothing else
     assert max(doubts[31:]) < 0.5
     assert doubts[31] < doubts[29]
+
+
+def test_a_hand_that_was_out_of_sight_has_not_jumped():
+    """In 0.7 s it moves by half a metre at 2 m/s^2, of the 4 that settings allow."""
+    assert max(run(anywhere(40), jumps=(10, 30), unseen=0.7)) < 0.05
 
 
 @pytest.mark.parametrize("rate", [10.0, 30.0, 100.0])
@@ -102,15 +93,12 @@ def test_a_camera_that_was_carried_is_doubted_for_a_second_at_any_rate(rate):
     assert max(before[-10:]) < 0.01
     assert 0.6 < np.sum(np.array(doubts) > 0.5) / rate < 1.2
     assert doubts[-1] < 0.35
-
-
-def test_a_hand_that_was_out_of_sight_has_not_jumped():
-    """In 0.7 s it moves by half a metre at 2 m/s^2, of the 4 that settings allow."""
-    assert max(jumping(0.7)) < 0.05
+    judge.add(jump, 1.0 / rate)
+    judge.reset()
+    assert judge.add(right, 1.0 / rate) < 0.1
 
 
 def test_landmarks_that_are_never_matched_are_named_and_no_others():
-    """Half of the matches are wrong by chance; five landmarks are gone."""
     judge, gone = Integrity(Acceleration()), np.arange(120) < 5
     for i in range(60):
         kept = (RNG.random(120) < 0.5) & ~gone
@@ -143,7 +131,6 @@ def test_a_landmark_that_has_been_matched_once_is_there():
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_right_maps_are_not_doubted_wherever_matches_lie(scene):
-    """Seeds, and two of the scenes, that the fit has not seen."""
     rows = [row for number in range(900, 906) for row in sequence(number, ("right",), scene)]
     said, right = recursive(rows), np.array([not row.wrong for row in rows])
     assert np.sum(right) > 15
@@ -161,10 +148,7 @@ def test_a_right_scene_in_the_middle_of_the_image_is_not_doubted(monkeypatch):
     monkeypatch.syspath_prepend(str(EXAMPLES))
     from moving_camera import HEIGHT, READOUT, WIDTH, K, Moving, matches, scene
 
-    camera = rsl.Camera(
-        width=WIDTH, height=HEIGHT, K=K, D=np.zeros(5), distortion_model="plumb_bob",
-        readout_time=READOUT, scan_direction="top_to_bottom",
-    )  # fmt: skip
+    camera = rsl.Camera(WIDTH, HEIGHT, K, readout_time=READOUT)
     tracker, doubts = rsl.Tracker(rsl.Localizer(camera)), []
     moving, points = Moving((0.1, -0.2, 0.0)), scene(150)
     for k in range(300):

@@ -3,7 +3,9 @@
 """What frames after frames say of lens and map: named with both numbers, or nothing."""
 
 import re
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ from rs_localizer.core.types import Failure
 from rs_localizer.lens_watch import LensWatch
 from rs_localizer.tracking import Tracker
 
-from .moving import camera_of
+from .moving import Moving, before, board, camera_of, squared
 
 WELL = CalibrationErrors(0.1, 4e-4, 0.05, 4e-4)
 
@@ -95,61 +97,68 @@ def test_what_motion_hides_within_a_frame_frames_together_tell(name, published, 
 
 
 TRUE = TrueCamera(1280, 720, focal=900.0, distortion=(0.0,) * 5, readout_time=0.02)
+CAMERA = camera_of(TRUE)
+WALL = np.random.default_rng(1).uniform(-1.0, 1.0, (60, 3)) * [1.1, 0.7, 0.0]
 
 
-def moving_board(board: np.ndarray, moved: np.ndarray, seconds: float) -> np.ndarray:
-    """Pixels of a board that moves: place (3,), angles (3,), and both per second."""
+def miscalibrated(focal: float = 1.0, across: float = 0.0) -> rsl.Camera:
+    """The camera as K has it with so many times the focal length, and so many px beside."""
+    K = CAMERA.K * np.diag([focal, focal, 1.0]) + CAMERA.K * (1.0 - np.eye(3))
+    K[0, 2] += across
+    return replace(CAMERA, K=K)
+
+
+def board_before(moved: np.ndarray) -> Moving:
+    """Of a board that moves: place (3,), angles (3,), and both per second."""
     place, angles, velocity, rates = moved.reshape(4, 3)
+    way = before(lambda t: (Rotation.from_rotvec(angles + rates * t), place + velocity * t))
+    return Moving(way, TRUE)
 
-    def local_at(delay: np.ndarray) -> np.ndarray:
-        time = (seconds - 0.01 + delay)[:, None]
-        return Rotation.from_rotvec(angles + rates * time).apply(board) + place + velocity * time
 
-    return TRUE.project_rolling(local_at, (len(board),))
+def followed(
+    camera: rsl.Camera, points: np.ndarray, moved: np.ndarray, noise: float, longer: Any = 0.0
+) -> Iterator[tuple[Tracker, Any, np.ndarray]]:
+    """The tracker after each of 24 images, what it found, and its error (6,)."""
+    random, tracker = np.random.default_rng(2), Tracker(rsl.Localizer(camera))
+    moving = board_before(moved)
+    for k in range(24):
+        pixels = moving.pixels(k / 30 - 0.4, points)
+        noisy = pixels + random.normal(0.0, noise, pixels.shape)
+        found = tracker.localize(10**12 + 33_333_333 * k, points + longer, noisy)
+        yield tracker, found, moving.error(found, k / 30 - 0.4)[:6] if found else None
 
 
 @pytest.mark.parametrize("lost", [False, True])
 def test_a_recording_with_gaps_shows_no_other_matrix(lost):
     """Stamps run on while the camera is elsewhere, or an image is lost: no parabola fits."""
-    random = np.random.default_rng(1)
-    camera = camera_of(TRUE)
-    across, along = np.meshgrid(0.05 * np.arange(-3.5, 4.0), 0.05 * np.arange(-2.5, 3.0))
-    board = np.column_stack([across.ravel(), along.ravel(), np.zeros(across.size)])
+    random, corners = np.random.default_rng(1), board(8, 6, 0.35, 0.25)
     usual, gaps = np.repeat([0.12, 0.2, 0.2, 0.3], 3), (2, 5)
     for _ in range(8):
-        tracker = Tracker(rsl.Localizer(camera))
+        tracker = Tracker(rsl.Localizer(CAMERA))
         for k in range(6):
             if k == 0 or (k in gaps and not lost):
-                moved = random.normal(0.0, usual) + np.eye(12)[2] * 0.6
+                moving = board_before(random.normal(0.0, usual) + np.eye(12)[2] * 0.6)
             image = k + (sum(k >= gap for gap in gaps) if lost else 0)
-            pixels = moving_board(board, moved, image / 30)
+            pixels = moving.pixels(image / 30, corners)
             pixels += random.normal(0.0, 0.3, pixels.shape)
-            tracker.localize(10**12 + 33_333_333 * k, board, pixels)
+            tracker.localize(10**12 + 33_333_333 * k, corners, pixels)
             assert tracker.lens.fault == ""
 
 
 @pytest.mark.parametrize(("angle", "surely"), [(0.7, True), (1.57, False)])
 def test_a_map_that_is_longer_one_way_moves_as_frames_tell(angle, surely):
     """Errors of a map of a board of 1 m, which is longer by 1 % at this angle, before 1.6 m."""
-    camera = rsl.Camera(1280, 720, [[900, 0, 639.5], [0, 900, 359.5], [0, 0, 1]], readout_time=0.02)
-    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 9), np.linspace(-0.3, 0.3, 6))
-    board = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-    along = np.array([np.cos(angle), np.sin(angle), 0.0])
+    corners, along = board(9, 6, 1.0, 0.6), np.array([np.cos(angle), np.sin(angle), 0.0])
     moved = np.r_[0.0, 0.0, 1.6, 0.2, -0.3, 0.1, -0.2, 0.2, 0.1, 0.5, 0.6, -0.3]
-    for share in (0.0, 0.01):
-        random = np.random.default_rng(1)
-        tracker, longer = Tracker(rsl.Localizer(camera)), share * np.outer(board @ along, along)
-        for k in range(24):
-            pixels = moving_board(board, moved, k / 30 - 0.4)
-            pixels += random.normal(0.0, 0.1, pixels.shape)
-            tracker.localize(10**12 + 33_333_333 * k, board + longer, pixels)
-        stretch = tracker.lens.errors_of(None)
-        if share == 0.0:
-            assert stretch is None or np.abs(stretch.sizes).max() < 0.003
-            assert tracker.lens.fault == ""
+    *_, (right, _, _) = followed(CAMERA, corners, moved, 0.1)
+    assert right.lens.fault == ""
+    stretch = right.lens.errors_of(None)
+    assert stretch is None or np.abs(stretch.sizes).max() < 0.003
+    longer = 0.01 * np.outer(corners @ along, along)
+    *_, (tracker, _, _) = followed(CAMERA, corners, moved, 0.1, longer)
     # One half of it is a stretch that frames show, the other half that all is larger. Along the
     # columns fy over fx may have half of it.
-    off = stretch.at(board + longer).sum(axis=2) - longer
+    off = tracker.lens.errors_of(None).at(corners + longer).sum(axis=2) - longer
     assert np.linalg.norm(off) < (0.35 if surely else 0.6) * np.linalg.norm(longer)
     found = re.search(r"longer by (\S+) % along \((\S+), (\S+), (\S+)\)", tracker.lens.fault)
     assert (found is not None) == surely
@@ -161,34 +170,18 @@ def test_a_map_that_is_longer_one_way_moves_as_frames_tell(angle, surely):
 
 def test_a_wrong_lens_before_a_wall_is_no_part_of_it_that_moved():
     """Frames leave 3 px, as of errors that nobody knows, and looked like a part that moved."""
-    random = np.random.default_rng(1)
-    camera = camera_of(TRUE)
-    K = camera.K * [[0.8, 1.0, 1.0], [1.0, 0.8, 1.0], [1.0, 1.0, 1.0]]
-    tracker = Tracker(rsl.Localizer(replace(camera, K=K)))
-    wall = np.column_stack([random.uniform(-1.0, 1.0, (60, 2)) * [1.1, 0.7], np.zeros(60)])
     moved, said = np.r_[0.0, 0.0, 2.0, 0.4, 0.3, 0.0, 0.4, 0.2, 0.1, 0.05, 0.2, 0.1], []
-    for k in range(24):
-        pixels = moving_board(wall, moved, k / 30 - 0.4)
-        pixels += random.normal(0.0, 0.3, pixels.shape)
-        tracker.localize(10**12 + 33_333_333 * k, wall, pixels)
+    for tracker, _, _ in followed(miscalibrated(0.8), WALL, moved, 0.3):
         assert tracker.moved is None
         said.append(tracker.lens.fault)
-    assert all("a focal length 1.2" in each for each in said[8:]), said
+    assert "a focal length 1.2" in said[-1]
+    assert all("a focal length 1.2" in each for each in said if each), said
 
 
 @pytest.mark.parametrize("across", [0.0, 70.0])
 def test_another_principal_point_before_a_wall_is_named(across):
-    random = np.random.default_rng(1)
-    camera = camera_of(TRUE)
-    K = camera.K.copy()
-    K[0, 2] += across
-    tracker = Tracker(rsl.Localizer(replace(camera, K=K)))
-    wall = np.column_stack([random.uniform(-1.0, 1.0, (60, 2)) * [1.1, 0.7], np.zeros(60)])
     moved = np.r_[0.0, 0.0, 2.0, 0.5, 0.2, 0.0, 0.3, 0.2, 0.1, 0.6, 0.6, 0.3]
-    for k in range(24):
-        pixels = moving_board(wall, moved, k / 30 - 0.4)
-        pixels += random.normal(0.0, 0.1, pixels.shape)
-        tracker.localize(10**12 + 33_333_333 * k, wall, pixels)
+    *_, (tracker, _, _) = followed(miscalibrated(across=across), WALL, moved, 0.1)
     fault = tracker.lens.fault
     assert re.search(r"a principal point -[67]\d, ", fault) if across else not fault, fault
 
@@ -196,26 +189,11 @@ def test_another_principal_point_before_a_wall_is_named(across):
 @pytest.mark.parametrize("share", [0.6, 0.8, 1.25])
 def test_poses_allow_for_a_matrix_that_frames_doubt(share):
     """From there on no pose is beyond five deviations, and few are outside their regions."""
-    random = np.random.default_rng(1)
-    camera = camera_of(TRUE)
-    K = camera.K * [[share, 1.0, 1.0], [1.0, share, 1.0], [1.0, 1.0, 1.0]]
-    x, y = np.meshgrid(np.linspace(-0.25, 0.25, 9), np.linspace(-0.15, 0.15, 6))
-    board = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     moved = np.r_[0.0, 0.0, 1.0, 0.2, 0.35, 0.0, 0.3, 0.0, 0.1, 0.05, 0.2, 0.1]
-    tracker, far = Tracker(rsl.Localizer(replace(camera, K=K))), list[float]()
-    for k in range(24):
-        seconds = k / 30 - 0.4
-        pixels = moving_board(board, moved, seconds)
-        pixels += random.normal(0.0, 0.3, pixels.shape)
-        found = tracker.localize(10**12 + 33_333_333 * k, board, pixels)
-        if not (found and tracker.lens.doubted):
-            continue
-        place, angles, velocity, rates = moved.reshape(4, 3)
-        turn = Rotation.from_rotvec(angles + rates * seconds).as_matrix()
-        position = -turn.T @ (place + velocity * seconds)
-        off = Rotation.from_matrix(found.rotation @ turn.T).inv().as_rotvec()
-        off = np.r_[off, found.rotation @ (found.position - position)]
-        far.append(off @ np.linalg.solve(found.covariance[:6, :6], off))
+    far = list[float]()
+    for tracker, found, off in followed(miscalibrated(share), board(9, 6, 0.5, 0.3), moved, 0.3):
+        if found and tracker.lens.doubted:
+            far.append(squared(off, found.covariance))
     assert max(far, default=0.0) < 42.0, far  # five deviations of six numbers
     assert np.quantile(far, 0.75) < 12.6 if far else tracker.lens.refusal, far
     assert tracker.lens.doubted
@@ -223,6 +201,5 @@ def test_poses_allow_for_a_matrix_that_frames_doubt(share):
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_board_that_no_hypothesis_explains_is_refused(seed):
-    """It raised LinAlgError: where nothing is found there are no leans to integrate over."""
     (kind,) = [kind for kind in kinds() if kind.name == "f of 1.9 times, board"]
     assert judged(kind, seed).published < 30

@@ -61,7 +61,6 @@ def angle(rotation, other):
 
 
 def test_a_first_guess_of_infinite_variances_is_no_prediction():
-    """Before a lens that is off, a guess left an error twice in the covariance of real boards."""
     bent = replace(TRUE, distortion=(-0.08, *TRUE.distortion[1:]))
     points, pixels, _ = frame(Path(3, true=bent), noise=0.1)
     localizer = rsl.Localizer(camera())
@@ -174,7 +173,6 @@ def resident():
 
 @pytest.mark.parametrize("count", [1000, pytest.param(10_000, marks=pytest.mark.bench)])
 def test_memory_stays_as_it_is_from_frame_to_frame(count):
-    """Of frames alone and tracked, with a pose and without one."""
     localizer = rsl.Localizer(camera())
     tracker, rng = rsl.Tracker(localizer), np.random.default_rng(0)
     nonsense = FRAMES[0][0], rng.uniform([0, 0], [639, 479], (60, 2))
@@ -332,7 +330,6 @@ def test_wrong_arrays_are_refused_with_what_was_found(arguments, said):
 
 
 def test_points_that_a_map_of_known_deviation_has_elsewhere_are_inliers():
-    """The map's deviation, as it is seen from here, widens the gate."""
     deviation, rng = 0.02, np.random.default_rng(5)
     points, pixels, _ = frame(Path(), count=120, noise=0.3, depth=(2.5, 4.0))
     localizer = rsl.Localizer(camera(), rsl.LocalizerConfig(map_deviation=deviation))

@@ -90,7 +90,6 @@ def test_shared_files_lie_where_ros_looks_and_commands_can_be_imported(setup_say
 
 
 def test_bounds_are_the_same_everywhere(setup_says):
-    """Of what has private or moving parts in use; setup.py says them."""
     said = setup_says(ROOT)
     asked = {f"{name}{versions}" for name, versions in missing.BOUNDS.items()}
     assert f"rosbags{missing.BOUNDS['rosbags']}" in said["install_requires"]

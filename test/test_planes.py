@@ -114,7 +114,6 @@ def small_planes():
 
 
 def test_a_mirrored_pose_is_never_published(small_planes):
-    """Both leans are integrated, and the region says so (17 deg: by default refused)."""
     localizer, inside = rsl.Localizer(CAMERA), []
     for result, points, pixels, true in small_planes:
         published = localizer.localize(points, pixels)

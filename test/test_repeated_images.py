@@ -103,7 +103,6 @@ def test_a_moving_camera_cannot_see_the_same_image_again(held, source):
 
 
 def test_a_sudden_stop_is_no_hanging_stream():
-    """In a simulator without noise."""
     times, moving = np.arange(45) / RATE, Moving(stopping)
     frames = [frame(moving, min(t, 0.5 + STOP)) for t in times]
     found = results(Tracker(rsl.Localizer(CAMERA)), times, frames)

@@ -104,7 +104,6 @@ def test_exact_points_of_askew_cameras_give_the_motion(scan):
 
 
 def test_the_estimate_is_that_of_plain_least_squares():
-    """By SciPy and OpenCV, from the equation of core/rig.py and what is known of motions."""
     mounted = pair(ASKEW, BESIDE, 0.012, scan=Scan.UP, readout_time=0.02)
     config, middle = rsl.LocalizerConfig(calibration=CalibrationErrors(0.0, 0.0, 0.0, 0.0)), 0.016
     speed, change = config.velocity_prior, config.acceleration
@@ -143,7 +142,6 @@ def test_the_estimate_is_that_of_plain_least_squares():
 
 
 def test_a_camera_alone_is_a_rig_of_one():
-    """The same bytes, with and without outliers, scores, and before a wall."""
     alone = {"one": Mounted(TRUE, UPRIGHT, np.zeros(3))}
     rig = rig_of(alone)
     camera = rig.cameras["one"]

@@ -198,7 +198,6 @@ def off_at(tracker, t, moving=HAND):
 
 
 def test_poses_and_twists_at_any_time_are_covered():
-    """Between frames, within their rows, and after them; truth by finite differences."""
     lengths = []
     for start in 0.7 * np.arange(16):
         tracker = tracker_of()
@@ -346,7 +345,6 @@ def test_images_that_are_microseconds_apart_by_a_clock_since_the_boot_are_no_oth
 
 
 def test_images_that_are_seconds_apart_are_judged_too():
-    """None has a track; time passes for the doubt all the same."""
     chances = [found.integrity for _, found in followed((0.0, 2.0, 4.0), 80)]
     assert chances[2] < chances[1] < 0.5 * chances[0]
 
@@ -425,7 +423,6 @@ def test_turn_rates_of_a_shaken_camera_are_covered(noise, first, drone):
 
 
 def test_vibration_within_frames_is_no_error_of_the_map():
-    """Either moves points alike."""
     drone, turns = shaken(0.3, 60.0), []
     for t, found in followed(times(40), 80, MAP, drone, 0.3):
         assert found

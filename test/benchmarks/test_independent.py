@@ -124,7 +124,6 @@ def test_the_estimator_finds_the_truth_of_exact_pixels(scan):
 
 
 def test_nothing_of_the_package_is_imported():
-    """What judges the estimator must not be made of it."""
     files = sorted(Path(benchmarks.independent.__file__).parent.glob("*.py"))
     assert len(files) > 4
     for path in files:

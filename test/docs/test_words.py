@@ -132,7 +132,6 @@ def test_spelling_is_oxfords(page):
 
 
 def test_equations_are_those_of_a_named_paper():
-    """A docstring or comment that counts equations says in its file whose they are."""
     counted = re.compile(r"\b(?:eq\.|equations?) \(?\d")
     for path in sorted(PACKAGE.rglob("*.py")):
         text = path.read_text(encoding="utf-8")

@@ -9,19 +9,18 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import rs_localizer as rsl
 from rs_localizer.config import CalibrationErrors
-from rs_localizer.core import so3
-from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.core.state import POSE
+from rs_localizer.core.shutter import project_rolling
 from rs_localizer.estimation.calibration import ErrorModes, _columns
 
-CAMERA = rsl.Camera(
-    640, 480, np.array([[450.0, 0.0, 319.5], [0.0, 450.0, 239.5], [0.0, 0.0, 1.0]]),
-    readout_time=0.02,
-)  # fmt: skip
+from ..moving import AT_REST, board, error_of, pinhole, squared  # noqa: TID252 - package "test"
+from .frames import differences
+
+CAMERA = pinhole(450.0, readout_time=0.02)
 EXACT = CalibrationErrors(0.0, 0.0, 0.0, 0.0)
 
 
@@ -32,49 +31,45 @@ def test_errors_of_a_lens_move_pixels_as_differences_of_opencv_say(coefficients)
     K = np.array([[430.0, 0.0, 310.0], [0.0, 470.0, 250.0], [0.0, 0.0, 1.0]])
     D = rng.uniform(-0.05, 0.05, coefficients)
     rays = rng.uniform([-0.7, -0.5], [0.7, 0.5], (20, 2))
-    deviation, step = CalibrationErrors(0.7, 0.01, 1.3, 0.02), 1e-5
+    deviation = CalibrationErrors(0.7, 0.01, 1.3, 0.02)
     model = "rational_polynomial" if coefficients > 5 else "plumb_bob"
     found = _columns(rsl.Camera(640, 480, K, D=D, distortion_model=model), rays, deviation)
 
-    def pixels(focal, k1):
+    def pixels(by):
+        """Of a focal length and a k1 that are off by so much."""
         lens = np.append(D, np.zeros(max(5 - len(D), 0)))
-        lens[0] += k1
+        lens[0] += by[1]
         points = np.column_stack([rays, np.ones(len(rays))])
-        scaled = K * [[1.0 + focal, 1.0, 1.0], [1.0, 1.0 + focal, 1.0], [1.0, 1.0, 1.0]]
+        scaled = K * [[1.0 + by[0], 1.0, 1.0], [1.0, 1.0 + by[0], 1.0], [1.0, 1.0, 1.0]]
         return cv2.projectPoints(points, np.zeros(3), np.zeros(3), scaled, lens)[0][:, 0]
 
-    by_focal = (pixels(step, 0.0) - pixels(-step, 0.0)) / (2.0 * step)
-    by_k1 = (pixels(0.0, step) - pixels(0.0, -step)) / (2.0 * step)
-    focal = K[0, 0] * K[1, 1]
-    corner = 400.0 / np.sqrt(focal)  # focal lengths, of 640 x 480
-    k1 = 1.3 / (np.sqrt(focal) * corner**3)
-    np.testing.assert_allclose(found[:, :, 0], 0.7 * np.tile([1.0, 0.0], (20, 1)))
-    np.testing.assert_allclose(found[:, :, 1], 0.7 * np.tile([0.0, 1.0], (20, 1)))
-    np.testing.assert_allclose(found[:, :, 2], 0.01 * by_focal, atol=1e-6)
-    np.testing.assert_allclose(found[:, :, 3], k1 * by_k1, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(found[:, :, 4], 0.01 * by_focal * [-1.0, 1.0], atol=1e-6)
+    by_focal, by_k1 = np.moveaxis(differences(pixels, 2, 1e-5), -1, 0)
+    focal = np.sqrt(K[0, 0] * K[1, 1])
+    corner = 400.0 / focal  # focal lengths, of 640 x 480
+    k1 = 1.3 / (focal * corner**3)
+    for column, expected in enumerate((
+        0.7 * np.tile([1.0, 0.0], (20, 1)), 0.7 * np.tile([0.0, 1.0], (20, 1)), 0.01 * by_focal,
+        k1 * by_k1, 0.01 * by_focal * [-1.0, 1.0],
+    )):  # fmt: skip
+        np.testing.assert_allclose(found[:, :, column], expected, rtol=1e-6, atol=1e-6)
 
 
 def off(principal_point: float = 0.0, focal_length: float = 0.0) -> rsl.Camera:
     """The camera as a calibration has it that is off by so much."""
-    K = CAMERA.K.copy()
-    K[:2, 2] += principal_point
-    K[(0, 1), (0, 1)] *= 1.0 + focal_length
+    K = CAMERA.K * np.diag([1.0 + focal_length, 1.0 + focal_length, 1.0])
+    K[:2, 2] = CAMERA.K[:2, 2] + principal_point
     return replace(CAMERA, K=K)
 
 
-def frame(seed: int, depth: float, noise: float = 0.3) -> tuple[np.ndarray, np.ndarray, Motion]:
+def frame(seed: int, depth: float, noise: float = 0.3) -> tuple[np.ndarray, np.ndarray, rsl.Motion]:
     """Points of a room 3 m away, so many metres deep, and their pixels."""
     rng = np.random.default_rng(seed)
     points = rng.uniform([-2.0, -1.5, 0.0], [2.0, 1.5, depth], (100, 3))
-    rotation = so3.exp(rng.normal(scale=0.15, size=3))
-    motion = Motion(
-        rotation, [0.0, 0.0, 3.0], rng.normal(scale=0.01, size=3), rng.normal(scale=0.01, size=3)
-    )
+    rotation = Rotation.from_rotvec(rng.normal(scale=0.15, size=3)).as_matrix()
+    motion = rsl.Motion(rotation, [0.0, 0.0, 3.0], *rng.normal(scale=0.01, size=(2, 3)))
     pixels, _ = project_rolling(CAMERA, motion.at_rows, points)
-    inside = np.all((pixels > 0.0) & (pixels < [639.0, 479.0]), axis=1)
-    pixels = pixels[inside] + rng.normal(scale=noise, size=(np.count_nonzero(inside), 2))
-    return points[inside], pixels, motion
+    seen = CAMERA.inside(pixels)
+    return points[seen], pixels[seen] + rng.normal(scale=noise, size=(seen.sum(), 2)), motion
 
 
 def bent(points: np.ndarray, seed: int) -> np.ndarray:
@@ -86,11 +81,12 @@ def bent(points: np.ndarray, seed: int) -> np.ndarray:
     return points + 0.01 * np.sqrt(2.0) * off
 
 
+Mapped = tuple[np.ndarray, ErrorModes | None]
+
+
 def inside(
     localizer: rsl.Localizer, depth: float, frames: int = 40,
-    mapped: Callable[[np.ndarray, int], tuple[np.ndarray, ErrorModes | None]] = (
-        lambda points, _: (points, None)
-    ),
+    mapped: Callable[[np.ndarray, int], Mapped] = lambda points, _: (points, None),
     noise: float = 0.3, least: float = 1.0,
 ) -> float:  # fmt: skip
     """Share of poses within their 95 % regions; of the frames at least so many have one."""
@@ -102,11 +98,8 @@ def inside(
         if not found:
             assert least < 1.0, str(found)
             continue
-        centre = -true.rotation.T @ true.translation
-        turn = so3.log(np.ascontiguousarray(found.rotation @ true.rotation.T))
-        error = np.concatenate([turn, found.rotation @ (centre - found.position)])
-        squared = error @ np.linalg.solve(found.covariance[POSE, POSE], error)
-        held.append(squared < chi2.ppf(0.95, 6))
+        error = error_of(found, true)[:6]
+        held.append(squared(error, found.covariance) < chi2.ppf(0.95, 6))
     assert len(held) >= least * frames
     return float(np.mean(held))
 
@@ -115,24 +108,21 @@ def test_regions_hold_in_a_map_that_tells_which_errors_its_landmarks_share():
     """Eight waves of 2 mm, too long to show as smooth errors; untold, 0.28 are inside."""
     localizer = rsl.Localizer(CAMERA, calibration=EXACT)
 
-    def mapped(
-        points: np.ndarray, seed: int, told: bool = True
-    ) -> tuple[np.ndarray, ErrorModes | None]:
+    def told(points: np.ndarray, seed: int) -> Mapped:
         rng = np.random.default_rng(100 + seed)
         waves, phases = 0.5 * rng.normal(size=(3, 8)), rng.uniform(0.0, 2.0 * np.pi, 8)
         modes = 0.002 * np.sin(points @ waves + phases)[:, None] * rng.normal(size=(3, 8))
         landmarks = points + modes @ rng.normal(size=8)
-        return landmarks, ErrorModes(landmarks, modes) if told else None
+        return landmarks, ErrorModes(landmarks, modes)
 
-    assert inside(localizer, 2.0, mapped=mapped) >= 0.9
-    assert (
-        inside(localizer, 2.0, 15, lambda points, seed: mapped(points, seed, False), least=0.9)
-        < 0.6
-    )
+    def untold(points: np.ndarray, seed: int) -> Mapped:
+        return told(points, seed)[0], None
+
+    assert inside(localizer, 2.0, mapped=told) >= 0.9
+    assert inside(localizer, 2.0, 15, untold, least=0.9) < 0.6
 
 
 def test_errors_of_a_map_are_those_of_the_nearest_landmark_if_it_is_near():
-    """Also of two that are near, of walls and rows, and of none."""
     rng = np.random.default_rng(0)
     wall, row = rng.uniform(0.0, 3.0, (500, 3)), np.linspace([0.0, 0.0, 1.0], [0.0, 0.0, 9.0], 90)
     wall[:, 1] = 2.0
@@ -167,43 +157,30 @@ def test_regions_hold_with_an_ordinary_calibration(depth, errors):
 def test_regions_hold_before_a_bent_map_that_is_declared(depth, least):
     """A map is off in metres, so by more pixels where it is near: the smooth error has a depth.
 
-    In rooms 98 %, before walls 86 % of 200 are inside (97 % with an ordinary calibration): the
-    waves are longer than what is expected of paper.
+    In rooms 98 %, before walls 86 % of 200 are inside: waves are longer than expected of paper.
     """
     declared = rsl.Localizer(CAMERA, map_deviation=0.01, calibration=EXACT)
-    found = inside(declared, depth, 30, lambda points, seed: (bent(points, seed), None))
-    assert found >= least
+    assert inside(declared, depth, 30, lambda points, seed: (bent(points, seed), None)) >= least
 
 
 def test_poses_before_a_curled_sheet_stay_in_their_regions():
     """A corner stands up by 1.5 cm, 50 times what is declared, and is left out in part."""
-    matrix = np.array([[2000.0, 0.0, 960.0], [0.0, 2000.0, 540.0], [0.0, 0.0, 1.0]])
-    localizer = rsl.Localizer(
-        rsl.Camera(1920, 1080, matrix, readout_time=0.02), map_deviation=0.0003
-    )
-    x, y = (
-        axis.ravel()
-        for axis in np.meshgrid(np.linspace(-0.15, 0.15, 13), np.linspace(-0.1, 0.1, 9))
-    )
-    flat = np.column_stack([x, y, np.zeros_like(x)])
-    curled = flat - 0.015 * np.clip(x / 0.15 + y / 0.2, 0.0, None)[:, None] ** 2 / 2.25 * [0, 0, 1]
+    camera = pinhole(2000.0, 1920, 1080, readout_time=0.02)
+    localizer, flat = rsl.Localizer(camera, map_deviation=0.0003), board(13, 9, 0.3, 0.2)
+    rise = np.clip(flat @ [1 / 0.15, 1 / 0.2, 0.0], 0.0, None) ** 2 / 2.25
     for seed in range(4):
         rng = np.random.default_rng(seed)
-        turn = so3.exp(np.array([0.3, 0.2, 0.1]) * rng.uniform(-1.0, 1.0, 3))
-        seen = curled @ turn.T + np.array([0.0, 0.0, 0.5])
-        pixels = 2000.0 * seen[:, :2] / seen[:, 2:] + [960.0, 540.0]
+        turn = Rotation.from_rotvec(np.array([0.3, 0.2, 0.1]) * rng.uniform(-1.0, 1.0, 3))
+        curled = flat - np.outer(rise, [0.0, 0.0, 0.015])
+        pixels = camera.project(turn.apply(curled) + np.array([0.0, 0.0, 0.5]))
         found = localizer.localize(flat, pixels + rng.normal(0.0, 0.3, pixels.shape))
         assert found, found
-        off = so3.log(np.ascontiguousarray(found.rotation @ turn.T))
-        spread = found.covariance[:3, :3]
-        assert off @ np.linalg.solve(spread, off) < 7.8  # 95 % of three degrees of freedom
+        off = error_of(found, replace(AT_REST, rotation=turn.as_matrix()))[:3]
+        assert squared(off, found.covariance) < 7.8  # 95 % of three degrees of freedom
         assert found.inliers.mean() > 0.9
 
 
 def test_regions_before_a_wall_count_the_smooth_errors_of_all_modes():
-    """A calibration with distortion that the lens has not: 0.21 of 14 when the fastest counted.
-
-    It is 1 to 2 px off, so that half of the frames are refused; of 200, 0.69 of 72 are inside.
-    """
+    """Distortion that the lens has not, 1 to 2 px, for which half of the frames are refused."""
     distorted = rsl.Localizer(replace(CAMERA, D=np.array([0.03, 0.0, 0.0, 0.0, 0.0])))
     assert inside(distorted, 0.0, noise=1.0, least=0.4) >= 0.6

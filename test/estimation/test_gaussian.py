@@ -173,7 +173,6 @@ def test_leans_are_integrated_as_on_a_fine_grid(tilt, noise):
 
 @pytest.mark.parametrize(("third", "fourth"), [(0.0, 0.1), (0.1, 0.0), (-0.05, 0.05)])
 def test_a_lean_that_is_nearly_gaussian_has_the_moments_of_its_orders(third, fourth, as_python):
-    """Against quadrature: by how much the evidence falls 1.5 deviations beside the mode."""
     deviation, axis = 0.05, np.array([0.0, 0.6, 0.8])
     covariance = np.diag(np.r_[np.full(3, 1e-4), np.full(15, 1.0)])
     covariance[:3, :3] += (deviation**2 - 1e-4) * np.outer(axis, axis)

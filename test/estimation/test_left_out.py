@@ -151,7 +151,6 @@ def test_near_points_of_a_rough_map_do_not_make_the_others_fit_by_chance(seed, d
 
 
 def test_gates_as_wide_as_a_motion_is_absurd_are_no_error():
-    """Wrong matches of a map of 0.3 m: some fits leave errors that no number holds."""
     localizer, random = rsl.Localizer(pinhole(), map_deviation=0.3), np.random.default_rng(3)
     wall = np.column_stack([random.uniform(-3.0, 3.0, (400, 2)), np.full(400, 3.0)])
     for _ in range(24):

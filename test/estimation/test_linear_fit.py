@@ -253,7 +253,6 @@ def test_no_size_of_errors_is_an_exception(noise, size):
 
 
 def test_noise_that_is_not_expected_speaks_for_vibration():
-    """By a half-normal prior of noise: the more, the more of its variance the vibration takes."""
     truth, _, shared, linear = shaking()
     known, one = known_at(PRIOR, truth), TurnPrior.of(VIBRATION.informations[3:4], np.zeros(1))
 

@@ -44,7 +44,6 @@ def test_the_truth_is_found_from_a_global_shutter_start():
 
 
 def test_the_minimum_has_no_slope_of_the_posterior():
-    """The gradient of cost plus prior vanishes, by finite differences of the cost itself."""
     observations, truth = frame(0, 0.1, 0.5, count=30)
     # Without the row's part the cost is exactly that of the residuals.
     data = changed(observations, gradient=np.zeros(2)).packed
@@ -121,7 +120,6 @@ def test_points_decide_what_the_prior_leaves_to_them(as_python):
 
 
 def test_the_noise_of_few_points_is_not_lowered_by_what_they_fit():
-    """Squared errors per degree of freedom, over many frames, are the variance of the noise."""
     squared, freedom = 0.0, 0.0
     for seed in range(60):
         observations, truth = frame(seed, 0.05, 0.5, count=20)

@@ -36,7 +36,6 @@ def frame(seed, count=200, outliers=0.0, plane=None):
 
 @pytest.mark.parametrize("outliers", [0.0, 0.5, 0.7])
 def test_of_an_ordinary_frame_no_more_samples_are_drawn(outliers):
-    """Those of the default, however many there may be."""
     for seed in range(5):
         default, patient = (
             Localizer(CAMERA, max_iterations=most).localize(*frame(seed, outliers=outliers))

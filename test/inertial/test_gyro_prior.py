@@ -23,7 +23,6 @@ from rs_localizer.tracking import Tracker
 
 
 def test_the_update_is_that_of_the_whole_filter():
-    """As a Kalman filter of motion and gyroscope at once, of an image that sees the motion."""
     rng = np.random.default_rng(3)
     root = rng.normal(size=(28, 28)) / np.r_[np.full(18, 1.0), np.full(10, 30.0)][:, None]
     joint = root @ root.T
@@ -108,7 +107,6 @@ def test_a_camera_at_rest_says_nothing_of_the_offset():
 
 @pytest.mark.parametrize("shaking", [((0.2, 60.0),), pytest.param((), marks=pytest.mark.bench)])
 def test_a_step_of_the_stamps_is_found(shaking):
-    """Another clock from one sample on, by 20 ms: more than a period of the vibration."""
     motion = partial(shaken_hand, shaking=shaking) if shaking else hand
     recorded = record(Camera(), motion, Rich(), (1, 70), 5, replace(Imu(), step=0.02))
     found = followed(recorded, 70)  # in the middle of them

@@ -19,7 +19,7 @@ from rs_localizer.inertial.turning import BETWEEN, GyroscopeErrors, read
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
 
-from ..moving import shown  # noqa: TID252 - Python has a package "test"
+from ..moving import Moving  # noqa: TID252 - Python has a package "test"
 
 READOUT_TIME = 0.03
 MIDDLE_NS = 10**12
@@ -27,26 +27,24 @@ TRUE = Camera(distortion=(0.0,) * 5, readout_time=READOUT_TIME)
 SETTINGS = InertialSettings(2e-4, 1e-4)
 
 
-class Shaken:
+class Shaken(Moving):
     """A hand's turn and a vibration of 0.3 deg at 60 Hz about one axis each, 0.5 m/s."""
 
-    def __init__(self, vibration=0.3, turn=40.0):
-        self.vibration, self.turn = np.radians(vibration), np.radians(turn)
-        self.start = Rotation.from_rotvec([0.3, -0.2, 0.5])
-        self.velocity = np.array([0.3, -0.4, 0.1])
+    def __init__(self, vibration=0.3, turn=40.0, velocity=(0.3, -0.4, 0.1)):
+        start, self.velocity = Rotation.from_rotvec([0.3, -0.2, 0.5]), np.array(velocity)
 
-    def pose(self, times):
-        """map_from_camera Rotations and positions (...,3) at times (...) in s."""
-        times = np.asarray(times)[..., None]
-        swing = self.vibration * np.sin(2.0 * np.pi * 60.0 * times + 0.7) * [0.6, 0.8, 0.0]
-        turn = Rotation.from_rotvec(self.turn * times * [0.0, 0.0, 1.0])
-        place = np.array([0.1, 0.2, -3.0]) + self.velocity * times
-        return self.start * turn * Rotation.from_rotvec(swing), place
+        def way(t):
+            swing = np.radians(vibration) * np.sin(2.0 * np.pi * 60.0 * t + 0.7) * [0.6, 0.8, 0.0]
+            turned = Rotation.from_rotvec(np.radians(turn) * t * [0.0, 0.0, 1.0])
+            place = np.array([0.1, 0.2, -3.0]) + self.velocity * t
+            return start * turned * Rotation.from_rotvec(swing), place
+
+        super().__init__(way, TRUE)
 
     def rate(self, times):
-        """Body rates (...,3) rad/s by differences."""
+        """Body rates (n,3) rad/s by differences."""
         step = 1e-6
-        before, after = self.pose(times - step)[0], self.pose(times + step)[0]
+        (before, _), (after, _) = self.pose(times - step), self.pose(times + step)
         return (before.inv() * after).as_rotvec() / (2.0 * step)
 
     def samples(self, rate=4000.0, reach=0.06):
@@ -54,14 +52,14 @@ class Shaken:
         times = np.arange(-round(reach * rate), round(reach * rate) + 1) / rate
         return ImuSamples(MIDDLE_NS + np.rint(1e9 * times).astype(np.int64), self.rate(times))
 
-    def frame(self, count=60):
+    def all_around(self, count=60):
         """Points (n,3) and raw pixels (n,2), each exposed with its own row."""
         rng = np.random.default_rng(0)
-        rotation, position = self.pose(0.0)
+        (rotation,), (position,) = self.pose([0.0])
         around = [rng.uniform(-reach, reach, count) for reach in (0.54, 0.405)]
         local = np.column_stack([*around, np.ones(count)]) * rng.uniform(2.0, 5.0, (count, 1))
         points = rotation.apply(local) + position
-        return points, shown(TRUE, self.pose, points)
+        return points, self.pixels(0.0, points)
 
 
 def errors(mean=(0.0,) * 10):
@@ -86,22 +84,21 @@ def known(samples, of):
 
 @pytest.mark.parametrize("solver", ["r6p_vcwt", "p3p"])
 def test_the_truth_comes_back_under_vibration(solver):
-    shaken = Shaken(vibration=0.3)
-    shaken.velocity = np.zeros(3) if solver == "p3p" else shaken.velocity
-    points, pixels = shaken.frame()
+    shaken = Shaken(velocity=np.zeros(3)) if solver == "p3p" else Shaken()
+    points, pixels = shaken.all_around()
     rotation = known(shaken.samples(), errors())
     found = Localizer(believed(TRUE), solver=solver).localize(points, pixels, rotation=rotation)
     assert found
     assert found.inliers.all()
     for tau in (-0.5, 0.0, 0.31):
-        rotation, position = shaken.pose(tau * READOUT_TIME)
+        t = tau * READOUT_TIME
+        (turned,), (position,) = shaken.pose([t])
         pose, twist = pose_at(found, tau), twist_at(found, tau, READOUT_TIME)
-        off = log(np.ascontiguousarray(pose.rotation @ rotation.as_matrix().T))
-        assert np.degrees(np.linalg.norm(off)) < 2e-4
+        off = Rotation.from_matrix(pose.rotation) * turned.inv()
+        assert np.degrees(off.magnitude()) < 2e-4
         assert np.linalg.norm(pose.position - position) < 2e-5
-        assert np.degrees(np.abs(twist.angular - shaken.rate(tau * READOUT_TIME)).max()) < 0.1
-        expected = rotation.inv().apply(shaken.velocity)
-        np.testing.assert_allclose(twist.linear, expected, atol=2e-3)
+        assert np.degrees(np.abs(twist.angular - shaken.rate(np.array([t]))).max()) < 0.1
+        np.testing.assert_allclose(twist.linear, turned.inv().apply(shaken.velocity), atol=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -132,7 +129,6 @@ def test_derivatives_by_what_the_gyroscope_is_off_by(far, since):
 
 
 def test_a_frame_long_ago_makes_no_rotation_within_this_one_slow(monkeypatch):
-    """Smoothed by all 4,000 readings of a second, a frame took 3 s."""
     solved, usual = [], turning.smoothed
     monkeypatch.setattr(turning, "smoothed", lambda *of: solved.append(len(of[0])) or usual(*of))
     shaken = Shaken(vibration=0.02)

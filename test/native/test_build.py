@@ -105,7 +105,6 @@ def parts(table: Array2) -> tuple[Array, Array, Array, float]:
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler")
 def test_parts_of_arrays_are_given_and_all_are_freed(tmp_path):
-    """By what the C knows of how Numba lays out arrays and counts references to them."""
     (tmp_path / "giving.py").write_text(GIVING)
     path = os.pathsep.join(map(str, (tmp_path, sources.PACKAGE.parent)))
     compiled(tmp_path, "v2" if platform.machine() == "x86_64" else "generic", "giving", path=path)

@@ -14,20 +14,9 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.solvers import r6p
 from rs_localizer.solvers.minimal import solve_minimal
 
+from .equations import directions, misses, seen_by
+
 BOUND = 1.0
-
-
-def residuals(p, v, c, w, t):
-    """The model of the solver: two rows of ``[x]x`` times the camera points, (h,12)."""
-    turned = p.points + np.cross(v[:, None], p.points)
-    r = p.tau[..., None]
-    seen = turned + r * np.cross(w[:, None], turned) + c[:, None] + r * t[:, None]
-    return (seen[..., :2] - p.rays * seen[..., 2:]).reshape(len(v), 12)
-
-
-def directions(rng, length):
-    vector = rng.normal(size=(len(length), 3))
-    return vector * (length / np.linalg.norm(vector, axis=1))[:, None]
 
 
 def problems(h, seed, *, rotation=30.0, translation=0.3, error=6.0, noise=0.0):
@@ -47,9 +36,7 @@ def problems(h, seed, *, rotation=30.0, translation=0.3, error=6.0, noise=0.0):
     scale = 0.5 / np.tan(np.radians(22.5))
     tau = np.zeros((h, 6))
     for _ in range(100):  # until every point is seen by its own row
-        r = tau[..., None]
-        placed = points + np.cross(v[:, None], points)
-        seen = placed + r * np.cross(w[:, None], placed) + c[:, None] + r * t[:, None]
+        seen = seen_by(points, tau, v, c, w, t)
         rays = seen[..., :2] / seen[..., 2:]
         previous, tau = tau, scale * rays[..., 1]
     settled = np.abs(tau - previous).max(axis=1) < 1e-13
@@ -63,8 +50,8 @@ def solutions(p):
     """Samples (m,) and v (m,3), before I + [v]x is replaced by the nearest rotation."""
     found = r6p.find_solutions(p.points, p.rays, p.tau, BOUND)
     of = found.sample
-    one = SimpleNamespace(points=p.points[of], rays=p.rays[of], tau=p.tau[of])
-    assert np.abs(residuals(one, found.v, found.c, found.w, found.t)).max() < 1e-9
+    seen = seen_by(p.points[of], p.tau[of], found.v, found.c, found.w, found.t)
+    assert np.abs(misses(p.rays[of], seen)).max() < 1e-9
     return of, found.v
 
 
