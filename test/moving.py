@@ -114,6 +114,9 @@ class Moving:
     ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
         """Some points that an image shows, and their pixels: of outliers, the first, anywhere."""
         rng = np.random.default_rng(round(t * 1e4) if seed is None else seed)
+        (rotation,), (place,) = self.pose([t])
+        at_once = self.true.project(rotation.inv().apply(points - place))
+        points = points[inside(self.true, at_once, margin=-150.0)]  # others take only time
         pixels = self.pixels(t, points)
         seen = np.flatnonzero(inside(self.true, pixels))
         seen = rng.choice(seen, min(count, len(seen)), replace=False)

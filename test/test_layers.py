@@ -6,8 +6,7 @@ import ast
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
-from functools import cache
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -58,17 +57,22 @@ MAY_IMPORT |= {
 }
 
 
-@cache
-def imported(source: str, inside: str) -> set[str]:
+TREES = {
+    str(path.relative_to(PACKAGE)): ast.parse(path.read_text(encoding="utf-8"))
+    for path in sorted(PACKAGE.rglob("*.py"))
+}
+
+
+def imported(tree: ast.AST, inside: list[str]) -> set[str]:
     """Absolute dotted names that a module of the package `inside` imports, late ones included."""
     names = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            parents = inside.split(".")[: len(inside.split(".")) + 1 - node.level]
-            base = ".".join([*parents, node.module or ""] if node.level else [node.module or ""])
-            names |= {f"{base.strip('.')}.{alias.name}" for alias in node.names}
+            parents = inside[: len(inside) + 1 - node.level] if node.level else []
+            base = ".".join([*parents, *filter(None, [node.module])])
+            names |= {f"{base}.{alias.name}" for alias in node.names}
     return names
 
 
@@ -80,16 +84,17 @@ def parts(names: set[str]) -> set[str]:
     return below & here | public
 
 
-def modules() -> Iterator[tuple[str, tuple[str, ...], set[str]]]:
-    """The file of each module in the package, its dotted name in parts, and what it imports."""
-    for path in sorted(PACKAGE.rglob("*.py")):
-        name = path.relative_to(PACKAGE.parent).with_suffix("").parts
-        yield str(path.relative_to(PACKAGE)), name, imported(path.read_text(), ".".join(name[:-1]))
+# Of each module: its file, its dotted name in parts, and what it imports.
+MODULES = [
+    (file, name, imported(tree, list(name[:-1])))
+    for file, tree in TREES.items()
+    for name in [("rs_localizer", *Path(file).with_suffix("").parts)]
+]
 
 
 def test_imports_go_down_only():
     wrong = []
-    for file, (_, part, *_), names in modules():
+    for file, (_, part, *_), names in MODULES:
         used = parts(names) - {part} | {name for name in names if name.startswith("benchmarks")}
         wrong += [f"{file} imports {bad}" for bad in sorted(used - MAY_IMPORT[part])]
     assert wrong == []
@@ -116,7 +121,7 @@ ONLY_IN = {
 def test_what_few_need_is_imported_where_they_need_it():
     packages = {name: places for names, places in ONLY_IN.items() for name in names}
     wrong = []
-    for file, _, names in modules():
+    for file, _, names in MODULES:
         used = {name.partition(".")[0] for name in names} & packages.keys()
         wrong += [f"{file} imports {name}" for name in used if not file.startswith(packages[name])]
     assert wrong == []
@@ -130,7 +135,7 @@ def test_a_localizer_loads_nothing_that_few_need():
     """
     apart = ("tools/", "cli/", "ros/", "native/", "__main__", *TRACED, "io/maps/colmap_process.py")
     apart += ("inertial/",)
-    loaded = [".".join(name) for file, name, _ in modules() if not file.startswith(apart)]
+    loaded = [".".join(name) for file, name, _ in MODULES if not file.startswith(apart)]
     names = ["rs_localizer.inertial", *(name for names in ONLY_IN for name in names)]
     code = (
         f"import importlib, sys\nfor name in {loaded}:\n    importlib.import_module(name)\n"
@@ -148,12 +153,12 @@ ROS_MAY_IMPORT: dict[str, set[str]] = {"node": set(), "localizer": {"node"}, "de
 
 def test_nodes_do_not_know_each_other():
     """What stands beside the folders starts nodes, and may import any of them."""
-    ros = PACKAGE / "ros"
-    folders = {path.name for path in ros.iterdir() if (path / "__init__.py").is_file()}
+    folders = {path.parent.name for path in (PACKAGE / "ros").glob("*/__init__.py")}
     assert folders == set(ROS_MAY_IMPORT)
     wrong = []
-    for file, (_, part, folder, *_), names in ((f, (*n, ""), i) for f, n, i in modules()):
-        if part == "ros" and folder in folders:
+    for file, (_, part, *inside), names in MODULES:
+        folder = inside[0] if part == "ros" and inside else ""
+        if folder in folders:
             used = {name.split(".")[2] for name in names if name.startswith("rs_localizer.ros.")}
             bad = (used & folders) - ROS_MAY_IMPORT[folder] - {folder}
             wrong += [f"{file} imports ros.{name}" for name in bad]
@@ -162,19 +167,17 @@ def test_nodes_do_not_know_each_other():
 
 def test_every_module_has_a_client() -> None:
     """Imported, or named where it is imported late; commands are found by their names."""
+    names = {name for *_, used in MODULES for name in used}
+    root, orphans = PACKAGE.parent, []
     texts = {path: path.read_text() for path in PACKAGE.rglob("*.py")}
-    names = {name for *_, used in modules() for name in used}
-    root = PACKAGE.parent
-    starts = [path.read_text() for path in (root / "setup.py", *root.glob("launch/*.py"))]
-    orphans = []
-    for path in texts:
-        module = ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
-        late = (".".join(module.split(".")[-2:]), f'"{path.stem}"', path.name)
-        if path.name.startswith("__") or module.startswith("rs_localizer.cli."):
+    texts |= {path: path.read_text() for path in (root / "setup.py", *root.glob("launch/*.py"))}
+    for file, (*_, folder, stem), _ in MODULES:
+        module = ".".join(Path("rs_localizer", file).with_suffix("").parts)
+        is_imported = any(f"{name}.".startswith(f"{module}.") for name in names)
+        if stem.startswith("__") or file.startswith("cli/") or is_imported:
             continue
-        if any(f"{name}.".startswith(f"{module}.") for name in names):
-            continue
-        others = [*starts, *(text for where, text in texts.items() if where != path)]
+        others = [text for where, text in texts.items() if where != PACKAGE / file]
+        late = f"{folder}.{stem}", f'"{stem}"', f"{stem}.py"
         if not any(name in text for name in late for text in others):
             orphans.append(module)
     assert orphans == []
@@ -195,68 +198,50 @@ BY_KEYWORDS = {
 }
 
 
-def functions(tree: ast.AST) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
-    """All but those that only type checkers see."""
-    for node in ast.iter_child_nodes(tree):
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
-            continue
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            yield node
-        yield from functions(node)
-
-
 def takes_many(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
     given = function.args
-    named = [item.arg for item in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
-    more = [item.arg for item in (given.vararg, given.kwarg) if item is not None]
+    every = [*given.posonlyargs, *given.args, *given.kwonlyargs, given.vararg, given.kwarg]
+    named = {item.arg for item in every if item is not None} - {"self", "cls"}
     decorators = {ast.unparse(item).partition("(")[0] for item in function.decorator_list}
-    return len({*named, *more} - {"self", "cls"}) > MOST and not decorators & COMPILED
+    for_type_checkers = ast.unparse(function.body[-1]) == "..."
+    return len(named) > MOST and not decorators & COMPILED and not for_type_checkers
 
 
 def test_no_function_takes_many_parameters():
     found = {
-        f"{path.relative_to(PACKAGE)}: {function.name}"
-        for path in PACKAGE.rglob("*.py")
-        for function in functions(ast.parse(path.read_text()))
-        if takes_many(function)
-    }
+        f"{file}: {node.name}" for file, tree in TREES.items() for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and takes_many(node)
+    }  # fmt: skip
     assert found == INSTEAD_OF_KERNELS | BY_KEYWORDS
 
 
 def test_each_module_and_class_has_a_name_of_its_own():
-    """But for ``__init__``, ``__main__``, ``build`` of kernels and of maps, and ``Options``."""
-    homes: dict[str, list[str]] = {}
-    for file in PACKAGE.rglob("*.py"):
-        tree = ast.parse(file.read_text(encoding="utf-8"))
-        names = [node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
-        for name in (*(name for name in names if name != "Options"), f"{file.stem}.py"):
-            homes.setdefault(name, []).append(str(file.relative_to(PACKAGE)))
-    excepted = ("__init__.py", "__main__.py", "build.py")
-    shared = {name: of for name, of in homes.items() if len(of) > 1 and name not in excepted}
-    assert shared == {}
+    nodes = [node for tree in TREES.values() for node in ast.walk(tree)]
+    names = [node.name for node in nodes if isinstance(node, ast.ClassDef)]
+    names += [Path(file).name for file in TREES]
+    shared = {name for name, count in Counter(names).items() if count > 1}
+    # Of kernels and of maps there is a build.
+    assert shared <= {"__init__.py", "__main__.py", "build.py", "Options"}
 
 
 def test_nodes_use_public_names_of_rclpy_only():
     """What rclpy calls with an underscore, or keeps in ``impl``, changes without notice."""
-    own, used = set(), {}
-    for path in sorted((PACKAGE / "ros").rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.FunctionDef):
-                own.add(node.name)
-            elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-                own.add(node.target.id)
-            elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
-                own.add(node.attr)
-            elif isinstance(node, ast.Attribute):
-                used[node.attr] = f"{path.name}:{node.lineno}"
-            elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rclpy.impl"):
-                used["_impl"] = f"{path.name}:{node.lineno}"
-            elif isinstance(node, ast.Constant) and str(node.value).startswith("_LifecycleNode"):
-                used[node.value] = f"{path.name}:{node.lineno}"
-    own |= {"_exit"}  # of os
-    private = {
-        name: where for name, where in used.items()
-        if name.startswith("_") and not name.endswith("__") and name not in own
-    }  # fmt: skip
-    assert private == {}
+    own, used = {"_exit"}, set()  # the former of os
+    for file, tree in TREES.items():
+        for node in ast.walk(tree) if file.startswith("ros/") else ():
+            match node:
+                case (
+                    ast.FunctionDef(name=name)
+                    | ast.AnnAssign(target=ast.Name(id=name))
+                    | ast.Attribute(attr=name, ctx=ast.Store())
+                ):
+                    own.add(name)
+                case ast.Attribute(attr=name):
+                    used.add(name)
+                case ast.ImportFrom(module=str(name)) if name.startswith("rclpy.impl"):
+                    used.add("_impl")
+                case ast.Constant(value=str(name)) if name.startswith("_LifecycleNode"):
+                    used.add(name)
+    private = {name for name in used - own if name.startswith("_") and not name.endswith("__")}
+    assert private == set()
     assert not any(name.startswith("_LifecycleNode") for name in own)

@@ -51,7 +51,6 @@ def test_versions_agree():
     assert f'\n  version: "{version}"' in recipe
 
 
-DOCKERFILE = ROOT / "packaging" / "docker" / "Dockerfile"
 # conda's names, where they differ from pip's.
 CONDA = {"opencv-python-headless": "py-opencv", "PyYAML": "pyyaml"}
 
@@ -75,9 +74,7 @@ def setup_says(monkeypatch) -> Callable[[Path], dict[str, Any]]:
 def test_shared_files_lie_where_ros_looks_and_commands_can_be_imported(setup_says):
     """What of it a wheel has, ``.ci/check_wheel.py`` and the smoke tests of CI see."""
     said = setup_says(ROOT)
-    shared = {
-        f"{folder}/{Path(file).name}" for folder, files in said["data_files"] for file in files
-    }
+    shared = {f"{to}/{Path(file).name}" for to, files in said["data_files"] for file in files}
     expected = {"ament_index/resource_index/packages/rs_localizer", "rs_localizer/package.xml"}
     expected |= {f"rs_localizer/config/{path.name}" for path in (ROOT / "config").glob("*")}
     expected |= {f"rs_localizer/launch/{path.name}" for path in (ROOT / "launch").glob("*.py")}
@@ -126,11 +123,8 @@ def test_conda_brings_what_pip_brings(setup_says):
 
 
 def test_the_container_is_built_of_files_that_exist():
-    text = DOCKERFILE.read_text()
-    copied = {
-        name for words in re.findall(r"^COPY (?!--)(.*) \S+$", text, re.MULTILINE)
-        for name in words.split()
-    }  # fmt: skip
+    text = (ROOT / "packaging" / "docker" / "Dockerfile").read_text()
+    copied = set(" ".join(re.findall(r"^COPY (?!--)(.*) \S+$", text, re.MULTILINE)).split())
     assert [name for name in copied if not (ROOT / name).exists()] == []
     # All that setup.py reads, and what the commands run.
     assert {"setup.py", "setup.cfg", "pyproject.toml", "package.xml", "README.md"} <= copied
@@ -138,9 +132,7 @@ def test_the_container_is_built_of_files_that_exist():
 
 
 def test_beside_ros_pip_requires_nothing(monkeypatch, setup_says):
-    """Rosdep brings all there; Ubuntu's OpenCV is no pip package: a requirement would stop the
-    installed executables.
-    """
+    """Ubuntu's OpenCV is no pip package: a requirement would stop the executables."""
     monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/jazzy")
     assert setup_says(ROOT)["install_requires"] == ["setuptools"]
 
@@ -148,8 +140,8 @@ def test_beside_ros_pip_requires_nothing(monkeypatch, setup_says):
 def test_rosdep_knows_every_key():
     keys = yaml.safe_load((ROOT / "test" / "rosdep_keys.yaml").read_text())
     package = parse_package(ROOT / "package.xml")
-    named = {item.name for kind in ("exec", "test", "build", "buildtool")
-             for item in getattr(package, f"{kind}_depends")}  # fmt: skip
+    kinds = ("exec_depends", "test_depends", "build_depends", "buildtool_depends")
+    named = {item.name for kind in kinds for item in getattr(package, kind)}
     assert named == keys["apt"].keys() | keys["after jazzy"].keys() | keys["ros"].keys()
     for names in (keys["apt"], keys["after jazzy"]):
         assert all(name.startswith("python3-") for name in names.values())  # and none by pip

@@ -18,12 +18,15 @@ IMAGES, PERIOD = 40, 1.0 / 30.02
 def gyroscope_at(middle_rows):
     """Mean turn rates (n,3), deg/s, of images with these middle rows (n,), s."""
     table = np.loadtxt(PHONE_GYROSCOPE)
-    means = []
-    for middle in middle_rows:
-        during = np.abs(table[:, 0] - middle) < 0.5 * READOUT_TIME
-        assert np.count_nonzero(during) >= 12  # 412 Hz
-        means.append(table[during, 1:].mean(axis=0))
-    return np.rad2deg(means)
+    during = np.abs(table[:, 0] - middle_rows[:, None]) < 0.5 * READOUT_TIME
+    assert during.sum(axis=1).min() >= 12  # 412 Hz
+    return np.rad2deg(during @ table[:, 1:] / during.sum(axis=1)[:, None])
+
+
+def errors_of(found, shift=0.0):
+    """Of rates (n,3) at times (n,), deg/s, before the gyroscope so much later."""
+    times, rates = found
+    return np.linalg.norm(rates - gyroscope_at(times + shift), axis=1)
 
 
 def twists(out: Path, *settings):
@@ -46,32 +49,23 @@ def at_once(tmp_path_factory):
 
 
 def test_tracked_twists_are_those_of_the_gyroscope(at_once):
-    times, rates = at_once
+    times, _ = at_once
     assert len(times) == IMAGES - 1  # no frame before the first one tells its twist
-    truth = gyroscope_at(times)
-    assert np.linalg.norm(truth, axis=1).max() > 30.0  # deg/s: there is something to tell
-    errors = np.linalg.norm(rates - truth, axis=1)
-    assert np.median(errors) < 3.5
-    assert np.percentile(errors, 95) < 10.0
+    assert np.linalg.norm(gyroscope_at(times), axis=1).max() > 30.0  # there is something to tell
+    assert np.median(errors_of(at_once)) < 3.5
+    assert np.percentile(errors_of(at_once), 95) < 10.0
 
 
 def test_one_image_later_they_are_twice_as_near(tmp_path, at_once):
-    times, rates = twists(tmp_path / "out", "output_lag:=1")
-    truth = gyroscope_at(times)
-    errors = np.linalg.norm(rates - truth, axis=1)
+    times, rates = later = twists(tmp_path / "out", "output_lag:=1")
     # The scale, and all of z, depend on the focal length, which the clip hardly tells.
-    assert np.all(np.abs(slopes(rates, truth) - 1.0) < [0.2, 0.2, 0.4])
-    times, rates = at_once
-    at_first = np.linalg.norm(rates - gyroscope_at(times), axis=1)
-    assert np.median(errors) < 0.6 * np.median(at_first)
+    assert np.all(np.abs(slopes(rates, gyroscope_at(times)) - 1.0) < [0.2, 0.2, 0.4])
+    assert np.median(errors_of(later)) < 0.6 * np.median(errors_of(at_once))
 
 
 def test_stamps_of_another_image_and_a_reversed_shutter_are_told(tmp_path, at_once):
     """What the first test would miss if it could not fail."""
-    times, rates = at_once
-    right = np.median(np.linalg.norm(rates - gyroscope_at(times), axis=1))
-    for frames in (-1, 1):
-        off = np.linalg.norm(rates - gyroscope_at(times + frames * PERIOD), axis=1)
-        assert np.median(off) > 1.5 * right
+    for shift in (-PERIOD, PERIOD):
+        assert np.median(errors_of(at_once, shift)) > 1.5 * np.median(errors_of(at_once))
     times, rates = twists(tmp_path / "out", "scan_direction:=bottom_to_top", "tracking:=false")
     assert slopes(rates, gyroscope_at(times))[0] < -0.5

@@ -27,6 +27,8 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.inertial.gyro_prior import GyroscopeTrack
 from rs_localizer.inertial.status import InertialSettings
 
+from .moving import AT_REST, error_of, squared
+
 UPRIGHT, TURNED = np.eye(3), np.diag([-1.0, -1.0, 1.0])
 ASKEW = exponential(np.array([0.2, -2.5, 0.4]))
 BESIDE = np.array([-0.1, 0.02, 0.03])
@@ -91,8 +93,7 @@ def test_exact_points_of_askew_cameras_give_the_motion(scan):
         for copied in (pickle.loads(pickle.dumps(result)), copy.deepcopy(result)):
             for name in parts:
                 np.testing.assert_array_equal(copied.residuals[name], result.residuals[name])
-        # Also at other times than the middle one.
-        there = result.at_time(100.0)
+        there = result.at_time(100.0)  # not the middle
         assert there.time == 100.0
         state = motions.states(np.array([frame]), np.zeros(1))
         np.testing.assert_allclose(there.position, state.position[0], atol=1e-3)
@@ -125,10 +126,9 @@ def test_the_estimate_is_that_of_plain_least_squares():
                 there = near + move + turned.apply(velocity * t + 0.5 * push * t**2)
                 now = turned * Rotation.from_rotvec(rate * t + 0.5 * twist * t**2)
                 local = now.inv().apply(points - there) @ mounted[name].rotation.T
+                lens, nowhere = np.array(camera.distortion), np.zeros(3)
                 local += mounted[name].translation
-                seen = cv2.projectPoints(
-                    local, np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.distortion)
-                )[0]
+                seen, _ = cv2.projectPoints(local, nowhere, nowhere, camera.matrix, lens)
                 of.append((seen.reshape(-1, 2) - pixels).ravel() / 0.5)
             return np.concatenate(of)
 
@@ -138,7 +138,7 @@ def test_the_estimate_is_that_of_plain_least_squares():
             best[:3], result.rotation @ best[3:6], best[6:12] * result.span - velocities
         ])  # fmt: skip
         # A fifth of a deviation of each, by mounts and lenses that are known to a tenth of a pixel.
-        assert apart @ np.linalg.solve(result.covariance, apart) < 0.6
+        assert squared(apart, result.covariance) < 0.6
 
 
 def test_a_camera_alone_is_a_rig_of_one():
@@ -239,11 +239,9 @@ def test_what_one_camera_has_wrong_widens_and_is_named(wrong, said):
         result = tracker.localize(round(1e9 * begin) + 10**15, parts)
         assert result, result
         state = motions.states(np.zeros(1, int), np.array([begin + middle_of(told)]))
-        off = np.concatenate([
-            logarithm(result.rotation @ state.rotation[0]),
-            result.rotation @ (state.position[0] - result.position),
-        ])  # fmt: skip
-        far.append(off @ np.linalg.solve(result.covariance[:6, :6], off))
+        rotation = state.rotation[0].T
+        truth = replace(AT_REST, rotation=rotation, translation=-rotation @ state.position[0])
+        far.append(squared(error_of(result, truth)[:6], result.covariance))
     assert np.mean(np.array(far) < 12.6) > 0.9, far
     assert max(far) < 25.0
     assert re.search(said, tracker.cameras.fault) if said else not tracker.cameras.fault

@@ -6,13 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rs_localizer.config import (
-    DetectorConfig,
-    FeatureConfig,
-    LocalizerConfig,
-    NodeConfig,
-    VelocityPrior,
-)
+from rs_localizer import config
 from rs_localizer.settings import SettingsError, build, load_params_file, parse_assignment, settings
 
 SHIPPED = Path(__file__).parents[1] / "config"
@@ -27,18 +21,16 @@ def params(tmp_path: Path, text: str) -> Path:
 @pytest.mark.parametrize(
     ("file", "kind"),
     [
-        ("rs_localizer.yaml", NodeConfig),
-        ("marker_detector.yaml", DetectorConfig),
-        ("feature_detector.yaml", FeatureConfig),
+        ("rs_localizer.yaml", config.NodeConfig),
+        ("marker_detector.yaml", config.DetectorConfig),
+        ("feature_detector.yaml", config.FeatureConfig),
     ],
 )
 def test_the_shipped_files_hold_exactly_the_defaults_and_name_all_choices(file, kind):
     path = SHIPPED / file
     values, known = load_params_file(path, kind), settings(kind)
     assert values == {name: setting.default for name, setting in known.items()}
-    assert [type(value) for value in values.values()] == [
-        type(known[name].default) for name in values
-    ]
+    assert all(type(value) is type(known[name].default) for name, value in values.items())
     assert build(values, kind) == kind()
     lines = [line.strip() for line in path.read_text().splitlines()]
     for name, setting in known.items():
@@ -77,9 +69,8 @@ def test_what_is_meant_for_the_node(tmp_path, text, values):
     assert load_params_file(params(tmp_path, text + OTHERS)) == values
     built = build(values)
     assert built.seed == values["seed"]
-    assert "velocity_prior.angular" not in values or built.velocity_prior == VelocityPrior(
-        0.5, 1e-3
-    )
+    moves = config.VelocityPrior(0.5, 1e-3)
+    assert built.velocity_prior == moves or "velocity_prior.angular" not in values
 
 
 @pytest.mark.parametrize(
@@ -132,4 +123,4 @@ def test_wrong_values(values, fault):
 @pytest.mark.parametrize("name", ["velocity_prior", "acceleration", "calibration"])
 def test_a_group_of_settings_is_of_its_own_class(name, value):
     with pytest.raises(ValueError, match=rf"{name} must be of type \w+, got {value}"):
-        LocalizerConfig(**{name: value})
+        config.LocalizerConfig(**{name: value})

@@ -17,6 +17,7 @@ import rs_localizer as rsl
 from rs_localizer.config import CalibrationErrors
 
 from .core.test_lens_laws import PAPERS, WIDE
+from .moving import error_of, squared
 
 SIZE, FOCAL, READOUT = 800, 210.0, 0.03
 K = np.array([[FOCAL, 0.0, 399.5], [0.0, FOCAL, 399.5], [0.0, 0.0, 1.0]])
@@ -42,18 +43,11 @@ def frame(rng, lens, count, noise, least=0.0):
         row = pixels[:, 1]
     pixels = pixels + noise * rng.normal(size=pixels.shape)
     shown = np.all((pixels > -0.5) & (pixels < SIZE - 0.5), axis=1)
-    return points[shown], pixels[shown], (rotation, position, turn, speed), angle[shown]
-
-
-def errors(result, motion):
-    """Errors (12,) in the camera's axes, per span."""
-    rotation, position, turn, speed = motion
-    return np.concatenate([
-        Rotation.from_matrix(result.rotation @ rotation.as_matrix()).as_rotvec(),
-        result.rotation @ (position - result.position),
-        turn * READOUT - result.angular_velocity,
-        speed * READOUT - result.linear_velocity,
-    ])  # fmt: skip
+    camera_from_map = rotation.inv().as_matrix()
+    truth = rsl.Motion(
+        camera_from_map, -camera_from_map @ position, READOUT * turn, READOUT * speed
+    )
+    return points[shown], pixels[shown], truth, angle[shown]
 
 
 def camera(lens):
@@ -71,8 +65,7 @@ def test_points_beyond_90_degrees_are_as_good_as_others(lens):
         pixels[wrong] = rng.uniform(0.0, SIZE - 1.0, (wrong.sum(), 2))
         result = localizer.localize(points, pixels)
         assert result
-        off = errors(result, motion)
-        squares.append(off[:6] @ np.linalg.solve(result.covariance[:6, :6], off[:6]))
+        squares.append(squared(error_of(result, motion)[:6], result.covariance))
         behind = (angle > math.radians(92.0)) & ~wrong
         used.extend(result.inliers[behind])
     assert len(used) > 40

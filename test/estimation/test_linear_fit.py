@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.special import logsumexp
 
 from rs_localizer.core.shake import CYCLES, TYPICAL_SIZES
@@ -146,21 +147,19 @@ def test_vibration_is_integrated_as_over_dense_matrices():
     prior = np.tile(-0.5 * (np.log(FACTORS) / np.log(10.0)) ** 2, 7)
     prior[: 2 * len(FACTORS)] -= 4.0
     prior -= logsumexp(prior)
-    rest = errors @ errors + noise**2 * (prior_cost + first @ slope) + first @ dense.T @ errors
+    rest = errors @ errors / noise**2 + prior_cost + first @ (dense.T @ errors / noise**2 + slope)
     for sizes, before in zip(every, prior, strict=True):
-        columns = turns * sizes
-        beside = columns.T @ columns / noise**2
-        across = np.linalg.solve(white, dense.T @ columns) / noise**2
-        beside -= columns.T @ dense / noise**2 @ across
-        along = columns.T @ (errors + dense @ first) / noise**2
-        inner = np.linalg.inv(np.eye(84) + beside)
-        explained = noise**2 * along @ inner @ along
-        left = 1.0 - explained / rest
-        logs.append(before + 0.5 * np.linalg.slogdet(inner)[1] - 0.5 * freedom * np.log(left))
-        pull = middle * sizes - across
-        mean = -inner @ along
-        second = rest * left / freedom / noise**2 * inner + np.outer(mean, mean)
-        moments.append(pull @ second @ pull.T)
+        columns, seen = np.hstack([dense, turns * sizes]), np.hstack([np.eye(18), middle * sizes])
+        precision, pull = columns.T @ columns / noise**2, columns.T @ errors / noise**2
+        precision += block_diag(information, np.eye(84))  # of the motion, and of each wave
+        pull[:18] += slope
+        step = -np.linalg.solve(precision, pull)
+        left = (errors @ errors / noise**2 + prior_cost + step @ pull) / rest
+        volume = np.linalg.slogdet(white)[1] - np.linalg.slogdet(precision)[1]
+        logs.append(before + 0.5 * volume - 0.5 * freedom * np.log(left))
+        wider = seen @ np.linalg.inv(precision) @ seen.T - np.linalg.inv(white)
+        moved_by = seen @ step - first
+        moments.append(rest * left / freedom * wider + np.outer(moved_by, moved_by))
     np.testing.assert_allclose(linear.every[:18, :18], dense.T @ dense)
     known = known_at(PRIOR, truth)
     found = fit(linear, shared, known, Noise(noise, 1.0, 18.0), VIBRATION, True)

@@ -16,18 +16,8 @@ from rs_localizer.estimation.robust import (
 )
 
 from .frames import changed, differences, fitted, frame
-from .projection import disturbed
 
 NO_PRIOR = motion_terms((0.0, 0.0), (0.0, 0.0))
-
-
-def test_a_step_turns_and_moves_the_camera_in_its_own_axes():
-    _, state = frame(0, 0.15, 0.0, acceleration=0.1)
-    step = np.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.6, *np.linspace(0.01, 0.12, 12)])
-    np.testing.assert_allclose(apply_step(state, step), disturbed(state, step), atol=1e-14)
-    # A search's step leaves the accelerations as they are.
-    step[12:] = 0.0
-    np.testing.assert_allclose(apply_step(state, step[:12]), disturbed(state, step), atol=1e-14)
 
 
 def test_the_truth_is_found_from_a_global_shutter_start():

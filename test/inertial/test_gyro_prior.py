@@ -21,6 +21,8 @@ from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.pose_at_time import twist_at
 from rs_localizer.tracking import Tracker
 
+from ..moving import squared  # noqa: TID252 - Python has a package "test"
+
 
 def test_the_update_is_that_of_the_whole_filter():
     rng = np.random.default_rng(3)
@@ -43,8 +45,7 @@ def test_the_update_is_that_of_the_whole_filter():
 
 def around(recorded, frame):
     """Samples of a frame until long after it: stamps may be late."""
-    (samples,) = recorded.samples
-    middle = recorded.frames.middle_ns(frame)
+    (samples,), middle = recorded.samples, recorded.frames.middle_ns(frame)
     first, last = np.searchsorted(samples.times_ns, [middle - 600_000_000, middle + 60_000_000])
     return ImuSamples(samples.times_ns[first:last], samples.angular_velocity[first:last])
 
@@ -64,12 +65,12 @@ def rate_errors(recorded, found, first):
     """Errors (n,3) of the turn rate in rad/s from a frame on, and their squared lengths (n,) in
     deviations.
     """
-    off, squared = [], []
+    off, far = [], []
     for frame, (_, result) in enumerate(found[first:], first):
         twist = twist_at(result, 0.0, recorded.frames.camera.readout_time)
         off.append(twist.angular - recorded.frames.middle.angular[frame])
-        squared.append(off[-1] @ np.linalg.solve(twist.covariance[3:, 3:], off[-1]))
-    return np.array(off), np.array(squared)
+        far.append(squared(off[-1], twist.covariance[3:, 3:]))
+    return np.array(off), np.array(far)
 
 
 @pytest.fixture(scope="module")
@@ -112,9 +113,9 @@ def test_a_step_of_the_stamps_is_found(shaking):
     found = followed(recorded, 70)  # in the middle of them
     assert abs(found[-1][0].time_offset + 0.02) < 1e-3
     assert "stamps" in found[-1][0].oddity
-    _, squared = rate_errors(recorded, found, 0)
-    assert np.mean(squared[35:50] < 7.81) > 0.4
-    assert np.mean(squared[50:] < 7.81) > 0.85
+    _, far = rate_errors(recorded, found, 0)
+    assert np.mean(far[35:50] < 7.81) > 0.4
+    assert np.mean(far[50:] < 7.81) > 0.85
 
 
 def test_the_bias_is_found(held):
@@ -159,26 +160,25 @@ def test_readings_tell_their_noise_and_how_well_they_tell_rates(rate):
     def true(time):
         return np.stack([np.sin(9.0 * time + k) + np.sin(250.0 * time - k) for k in range(3)], -1)
 
-    squared = []
+    ratios = []
     for _ in range(20):
         rates = true(times) + noise * np.sqrt(rate) * rng.normal(size=(len(times), 3))
         spectrum = spectrum_of(np.rint(1e9 * times).astype(np.int64), rates, 1e-4)
         assert np.sqrt(spectrum.noise / rate) == pytest.approx(noise, rel=0.35)
         near = slice(-len(spectrum.frequencies), None)
         mean, covariance = smoothed(times[near], rates[near], wanted, wanted, spectrum)
-        squared.append((mean - true(wanted)) ** 2 / covariance.diagonal()[:, None])
-    assert 0.5 < np.mean(squared) < 1.5
+        ratios.append((mean - true(wanted)) ** 2 / covariance.diagonal()[:, None])
+    assert 0.5 < np.mean(ratios) < 1.5
 
 
 @pytest.mark.parametrize("count", [2, 3, 7, 17])
 def test_few_readings_have_the_noise_that_is_given(count):
     times_ns, rates = (
         2_500_000 * np.arange(count),
-        np.linspace(0.1, 0.2, count)[:, None] * np.ones(3),
+        np.outer(np.linspace(0.1, 0.2, count), np.ones(3)),
     )
-    spectrum = spectrum_of(times_ns, rates, 1e-3)
+    spectrum, times = spectrum_of(times_ns, rates, 1e-3), 1e-9 * times_ns
     assert spectrum.noise == pytest.approx(400.0 * 1e-6)
-    times = 1e-9 * times_ns
     mean, covariance = smoothed(times, rates, times, times, spectrum)
     np.testing.assert_allclose(mean, rates, atol=0.05)
     assert np.linalg.eigvalsh(covariance).min() > -1e-9

@@ -9,15 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.aided import believed, record
-from benchmarks.independent.cameras import Camera
-from benchmarks.independent.gyroscopes import Imu
-from benchmarks.independent.motions import hand
-from benchmarks.independent.scenes import Rich
 from rs_localizer.inertial.oddities import ComparedTurns
 from rs_localizer.inertial.samples import ImuSamples
-from rs_localizer.localizer import Localizer
-from rs_localizer.tracking import Tracker
 
 PERIOD_NS = 33_333_333
 SWAY = np.array([[0.6, 2.1, 0.4], [0.5, 3.2, 1.7], [0.4, 4.4, 3.0]])  # rad/s, rad/s, rad of x, y, z
@@ -60,14 +53,8 @@ QUARTER = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         (np.zeros((3, 3)), "it always shows the same rates"),
         (np.diag([1.0, -1.0, -1.0]), "the camera's x y z are its x -y -z"),
         (QUARTER, "the camera's x y z are its -y x z"),
-        (
-            np.diag([1.0, -1.0, 1.0]),
-            "the camera's x y z are its x -y z, which no mount does: a sign is wrong",
-        ),
-        (
-            57.3 * QUARTER,
-            "the camera's x y z are its -y x z and it shows 5. times .*: degrees, not radians",
-        ),
+        (np.diag([1.0, -1.0, 1.0]), ".* are its x -y z, which no mount does: a sign is wrong"),
+        (57.3 * QUARTER, ".* are its -y x z and it shows 5. times .*: degrees, not radians"),
         (Rotation.from_rotvec([0.0, 0.5, 0.0]).as_matrix(), "its mount is 29 deg off"),
     ],
 )
@@ -77,14 +64,3 @@ def test_axes_signs_and_units_are_named(matrix, words):
 
 def test_turns_about_few_axes_tell_nothing():
     assert told(QUARTER, axes=1) == ""
-
-
-def test_a_camera_with_such_a_gyroscope_goes_on_alone_and_says_what_it_has():
-    recorded = record(Camera(), hand, Rich(), (1, 40), 4, Imu(axes=(2, -1, 3)))
-    tracker, aided = Tracker(Localizer(believed(recorded.frames.camera)), recorded.aid()), []
-    for frame in range(40):
-        seen, samples = recorded.frames.seen(frame, 1.0), recorded.around(frame)
-        result = tracker.localize(recorded.frames.middle_ns(frame), *seen, readings=samples)
-        aided.append(result.aided)
-    assert np.mean(aided) < 0.2
-    assert tracker.aid.status.oddity == "the camera's x y z are its -y x z"

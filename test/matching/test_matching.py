@@ -75,10 +75,9 @@ def test_the_two_nearest_within_the_gate(kind):
     everywhere[:, rows] = table
     at_found = np.take_along_axis(everywhere, found.landmarks, 1)
     np.testing.assert_allclose(at_found[there], expected[there], rtol=1e-5)
-    table = table[:, order]
-    np.testing.assert_array_equal(owners >= 0, np.isfinite(table.min(axis=0)))
-    own = np.flatnonzero(owners >= 0)
-    np.testing.assert_allclose(table[owners[own], own], table.min(axis=0)[own], rtol=1e-5)
+    nearest, own = table[:, order].min(axis=0), np.flatnonzero(owners >= 0)
+    np.testing.assert_array_equal(owners >= 0, np.isfinite(nearest))
+    np.testing.assert_allclose(table[owners[own], order[own]], nearest[own], rtol=1e-5)
 
 
 def matched(matcher: Matcher, points: Keypoints) -> dict[int, int]:
@@ -91,9 +90,8 @@ def test_an_id_that_comes_twice_in_an_image():
     ids = np.array([2, 1, 2, 1])
     assert matched(matcher, keypoints(4, ids=ids)) == {0: 1, 1: 0}
     best = matcher.match(keypoints(4, ids=ids, scores=np.array([1.0, 2.0, 3.0, 4.0])))
-    assert best.keypoints.tolist() == [2, 3]
-    assert best.landmarks.tolist() == [1, 0]
-    assert best.scores.tolist() == [3.0, 4.0]
+    found = zip(best.keypoints, best.landmarks, best.scores, strict=True)
+    assert list(found) == [(2, 1, 3.0), (3, 0, 4.0)]
 
 
 def bits(*counts: int) -> Any:

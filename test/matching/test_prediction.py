@@ -16,7 +16,8 @@ from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.matching import Matcher, predict_visible
 from rs_localizer.tools.simulation.scene import room
 
-K = np.array([[400.0, 0.0, 319.5], [0.0, 410.0, 239.5], [0.0, 0.0, 1.0]])
+from ..moving import pinhole  # noqa: TID252 - Python has a package "test"
+
 CAMERAS: dict[str, dict[str, Any]] = {
     "ideal": {},
     "sideways": {"scan_direction": "right_to_left"},
@@ -25,11 +26,9 @@ CAMERAS: dict[str, dict[str, Any]] = {
     "part": {"binning": (2, 2), "roi": Roi(100, 60, 400, 300)},
 }
 MOTION = Motion(
-    so3.exp(np.array([0.2, -0.4, 0.1])),
-    np.array([0.3, -0.1, 0.4]),
-    np.array([0.1, -0.2, 0.3]),
-    np.array([0.05, -0.03, 0.1]),
-)
+    so3.exp(np.array([0.2, -0.4, 0.1])), *np.array([[0.3, -0.1, 0.4], [0.1, -0.2, 0.3],
+                                                    [0.05, -0.03, 0.1]]),
+)  # fmt: skip
 SURE = Prior(motion=MOTION, covariance=1e-10 * np.eye(12))
 
 
@@ -40,7 +39,7 @@ def points() -> Any:
 
 @pytest.mark.parametrize("name", list(CAMERAS))
 def test_all_that_the_image_shows_is_predicted_where_it_is(name, points):
-    view = Camera(640, 480, K, readout_time=0.03, **CAMERAS[name])
+    view = pinhole(400.0, **CAMERAS[name])
     pixels, _ = project_rolling(view, MOTION.at_rows, points)
     shown = np.flatnonzero(view.inside(pixels))
     assert len(shown) > 300
@@ -69,7 +68,7 @@ def are_seen(view: Camera, points: Any, pixels: Any) -> Any:
 
 def test_a_prediction_tells_apart_what_looks_the_same(points):
     """Only a hundred kinds of landmarks: by their looks alone none is recognized."""
-    view = Camera(640, 480, K, readout_time=0.03)
+    view = pinhole(400.0)
     rng = np.random.default_rng(1)
     descriptors = rng.integers(0, 256, (100, 32), dtype=np.uint8)[rng.integers(0, 100, len(points))]
     pixels, _ = project_rolling(view, MOTION.at_rows, points)

@@ -24,20 +24,17 @@ def test_our_header_says_what_pythons_says(tmp_path):
     include = Path(sysconfig.get_paths()["include"])
     if not (include / "Python.h").is_file():
         pytest.skip("needs Python's headers")
-    made = tmp_path / "both.so"
-    objects = []
-    for source, folder in (("abi3_theirs.c", include), ("abi3_ours.c", sources.PACKAGE / "native")):
-        objects.append(tmp_path / f"{source}.o")
-        command = ["gcc", "-fPIC", "-c", HERE / source, "-I", folder, "-o", objects[-1]]
-        subprocess.run(command, check=True)
+    made, objects = tmp_path / "both.so", [tmp_path / "theirs.o", tmp_path / "ours.o"]
+    for file, folder in zip(objects, (include, sources.PACKAGE / "native"), strict=True):
+        source = HERE / f"abi3_{file.stem}.c"
+        subprocess.run(["gcc", "-fPIC", "-c", source, "-I", folder, "-o", file], check=True)
     subprocess.run(["gcc", "-shared", *objects, "-o", made], check=True)
     both = ctypes.CDLL(str(made))
-    count = both.their_count()
-    assert count > 10
-    assert [both.our(i) for i in range(count)] == [both.their(i) for i in range(count)]
-    assert [both.our_number(i) for i in range(NUMBERS)] == [
-        both.their_number(i) for i in range(NUMBERS)
-    ]
+    assert both.their_count() > 10
+    for i in range(both.their_count()):
+        assert both.our(i) == both.their(i)
+    for i in range(NUMBERS):
+        assert both.our_number(i) == both.their_number(i)
 
 
 def test_a_digest_follows_callees_in_other_files():

@@ -3,6 +3,7 @@
 """Entries: what Python may call a kernel with, and what becomes of the answer."""
 
 import gc
+import importlib
 import os
 import pickle
 import subprocess
@@ -22,17 +23,13 @@ JITTED = native.COMPILES
 
 def entries():
     """All entries of the package by name: what Python calls."""
-    import importlib
-
-    found = {}
     for module in sources.kernel_modules():
         importlib.import_module(module)
-    if JITTED:
-        from rs_localizer.native import jit
+    if not JITTED:
+        return declared.FUNCTIONS
+    from rs_localizer.native import jit
 
-        return {name: entry.py_func for name, entry in jit.ENTRIES.items()}
-    found.update(declared.FUNCTIONS)
-    return found
+    return {name: entry.py_func for name, entry in jit.ENTRIES.items()}
 
 
 def entry(name):
@@ -67,10 +64,8 @@ def faults_of(kind):
             other = "float32" if element == "float64" else "float64"
             yield np.zeros((1,) * dimensions, other), element
             yield np.zeros((1,) * (dimensions + 1), element), f"{dimensions} dimensions"
-            yield (
-                np.zeros((4,) * dimensions, element)[(slice(None, None, 2),) * dimensions],
-                "contiguous",
-            )
+            every_second = (slice(None, None, 2),) * dimensions
+            yield np.zeros((4,) * dimensions, element)[every_second], "contiguous"
             yield [0.0], "a contiguous array"
             size = np.dtype(element).itemsize
             if size > 1:

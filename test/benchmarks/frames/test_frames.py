@@ -23,10 +23,9 @@ def judged(count: int, wider: float = 1.0, farther: float = 1.0, seed: int = 0) 
     rng = np.random.default_rng(seed)
     figures = np.full((count, len(FIGURES)), 1.0)
     figures[:, 0] = np.arange(count)
-    for name in ("pose_s", "pose", "twist"):
-        figures[:, FIGURES.index(name)] = np.sum(rng.normal(size=(count, 6)) ** 2, axis=1) / wider
-    for name in ("turn_s", "turn", "way", "angular", "linear"):
-        figures[:, FIGURES.index(name)] = np.sum(rng.normal(size=(count, 3)) ** 2, axis=1) / wider
+    for freedom, names in ((6, "pose_s pose twist"), (3, "turn_s turn way angular linear")):
+        for name in names.split():
+            figures[:, FIGURES.index(name)] = rng.chisquare(freedom, count) / wider
     for name in ("deg_s", "deg", "mm", "deg/s", "m/s"):
         figures[:, FIGURES.index(name)] = farther * rng.rayleigh(size=count)
     return Judged(figures, [""] * count)
@@ -36,20 +35,15 @@ def published(rng: np.random.Generator, wider: float) -> tuple[float, float]:
     """Squared errors of a pose and twist, drawn from covariances that are then multiplied."""
     spread = rng.normal(size=(6, 6)) * np.repeat([1e-3, 1e-2], 3)[:, None]
     covariance = spread @ spread.T
-    rotation, position, *velocities = (
-        Rotation.random(random_state=rng.integers(2**31)).as_matrix(),
-        rng.normal(size=3), rng.normal(size=3), rng.normal(size=3),
-    )  # fmt: skip
+    rotation = Rotation.random(random_state=rng.integers(2**31)).as_matrix()
+    position, rate, velocity = rng.normal(size=(3, 3))
     way, turn = np.split(spread @ rng.normal(size=6), 2)
-    pose = BodyPose(
-        position - way,
-        # In the fixed axes of the map, as REP-103's covariances.
-        Rotation.from_rotvec(-turn).as_matrix() @ rotation,
-        covariance * wider,
-    )
+    # In the fixed axes of the map, as REP-103's covariances.
+    turned = Rotation.from_rotvec(-turn).as_matrix() @ rotation
+    pose = BodyPose(position - way, turned, covariance * wider)
     linear, angular = np.split(spread @ rng.normal(size=6), 2)
-    twist = Twist(velocities[1] - linear, velocities[0] - angular, covariance * wider)
-    truth = (rotation, position, *velocities)
+    twist = Twist(velocity - linear, rate - angular, covariance * wider)
+    truth = rotation, position, rate, velocity
     return of_pose(pose, truth)[0], of_twist(twist, truth)[0]
 
 

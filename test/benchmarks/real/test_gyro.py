@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.aided import believed
 from benchmarks.independent import motions
 from benchmarks.independent.cameras import Camera as TrueCamera
 from benchmarks.independent.frames import Frames, simulate
@@ -16,17 +17,12 @@ from benchmarks.real.gyroscopes import Gyroscope, aligned
 from benchmarks.real.peers import PEERS, solve_pnp
 from benchmarks.real.recordings import Frame, Recording, read_bag
 from rs_localizer.config import CalibrationErrors, NodeConfig
-from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.recording import write_frame
 
-TRUE = TrueCamera()
-CAMERA = Camera(TRUE.width, TRUE.height, K=TRUE.matrix, D=np.array(TRUE.distortion))
-LENGTH = 8
-# The lens is exact.
-CONFIG = NodeConfig(
-    readout_time=TRUE.readout_time, calibration=CalibrationErrors(0.0, 0.0, 0.0, 0.0)
-)
+TRUE, LENGTH = TrueCamera(), 8
+CAMERA, EXACT = believed(TRUE, 0.0), CalibrationErrors(0.0, 0.0, 0.0, 0.0)
+CONFIG = NodeConfig(readout_time=TRUE.readout_time, calibration=EXACT)
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +36,8 @@ def recording(frames, tmp_path_factory):
     with BagWriter(path) as bag:
         for k in range(LENGTH):
             points, pixels = frames.seen(k, 0.1)
-            ids = np.arange(len(points))
-            write_frame(bag, CAMERA, int(frames.stamp_ns[k]), points, pixels, ids)
+            stamp, ids = int(frames.stamp_ns[k]), np.arange(len(points))
+            write_frame(bag, CAMERA, stamp, points, pixels, ids)
     return path
 
 
