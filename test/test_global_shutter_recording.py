@@ -14,6 +14,8 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.pose_at_time import twist_at
 
+from .moving import squared
+
 # Of 6 dimensions: what 95 % of a chi-squared variable lie below.
 REGION = 12.59
 
@@ -53,8 +55,5 @@ def test_a_global_shutter_stays_one():
     for frame in frames:
         twist = twist_at(frame.estimate, 0.0, 1.0)  # per readout
         velocities = np.concatenate([twist.linear, twist.angular])
-        still.append(
-            not np.any(velocities)
-            or velocities @ np.linalg.solve(twist.covariance, velocities) < REGION
-        )
+        still.append(not velocities.any() or squared(velocities, twist.covariance) < REGION)
     assert np.mean(still) >= 0.99

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from rs_localizer.core.state import step_between
-from rs_localizer.estimation.prior import held_terms, motion_terms
+from rs_localizer.estimation.prior import motion_terms
 from rs_localizer.estimation.projection import squared_errors
 from rs_localizer.estimation.robust import (
     apply_step,
-    decided,
     inverted,
     noise_deviation,
     refine,
@@ -91,22 +90,6 @@ def test_noise_counts_the_degrees_of_freedom_and_never_divides_by_none():
     # Points strewn evenly over the gate show no noise that fits into it.
     strewn = np.linspace(0.0, 4.0, 500)
     assert noise_deviation(strewn, 2.0, 0.0) > 1.9
-
-
-def test_points_decide_what_the_prior_leaves_to_them(as_python):
-    share_of = as_python(decided)
-    factor = np.random.default_rng(0).normal(size=(18, 40))
-    noise, of_points = 0.5, factor @ factor.T
-    assert share_of(inverted(of_points), NO_PRIOR, noise) == pytest.approx(18.0)
-    held = of_points + noise**2 * held_terms().informations[0]
-    assert share_of(inverted(held), held_terms(), noise) == pytest.approx(6.0)
-    both = of_points + noise**2 * PRIOR.informations[0]
-    # Trace of the gain: each direction counts by the share of it that is the points'.
-    share = np.trace(np.linalg.solve(both, of_points))
-    assert 6.0 < share < 18.0
-    assert share_of(inverted(both), PRIOR, noise) == pytest.approx(share)
-    weak = 1e-9 * of_points + noise**2 * PRIOR.informations[0]
-    assert share_of(inverted(weak), PRIOR, noise) == pytest.approx(6.0, abs=1e-3)
 
 
 def test_the_noise_of_few_points_is_not_lowered_by_what_they_fit():
