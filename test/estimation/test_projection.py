@@ -27,24 +27,19 @@ def test_robust_cost_and_its_slope_belong_together(softness):
     np.testing.assert_allclose(derivative, 2 * slope, rtol=1e-3, atol=1.0)
 
 
-def test_truncated_costs_are_those_of_the_formulas(as_python):
-    truncated_cost = as_python(projection.truncated_cost)
+@pytest.mark.parametrize("softness", [0.0, 1.0])
+def test_robust_costs_are_those_of_the_formulas(softness):
     # A search's cost is that of its one look, which knows no accelerations.
     observations, state = frame(5, 0.15, 2.0, count=21)
     data = changed(observations, gradient=np.zeros(2)).packed
-    squared, c2 = projection.squared_errors(data, observations.count, state), 9.0
-    assert (squared > c2).any()
-    assert (squared < c2).any()
-    truncated = truncated_cost(data, state, 3.0, np.inf)
-    assert truncated == pytest.approx(np.minimum(squared, c2).sum())
+    ratios = projection.squared_errors(data, observations.count, state) / 9.0
+    assert (ratios > 1.0).any()
+    assert (ratios < 1.0).any()
+    truncated, tukey = np.minimum(ratios, 1.0), (1 - (1 - np.minimum(ratios, 1.0)) ** 3) / 3
+    expected = 9.0 * (truncated if softness == 0.0 else tukey).sum()
     information, slope = np.empty((18, 18)), np.empty(18)
-    tukey = c2 / 3 * (1 - (1 - np.minimum(squared / c2, 1)) ** 3)
-    for softness, expected in ((0.0, truncated), (1.0, tukey.sum())):
-        assert projection.normal_equations(
-            data, state, 3.0, softness, 2, information, slope
-        ) == pytest.approx(expected)
-    bounded = truncated_cost(data, state, 3.0, 0.1 * truncated)
-    assert 0.1 * truncated <= bounded < truncated
+    found = projection.normal_equations(data, state, 3.0, softness, 2, information, slope)
+    assert found == pytest.approx(expected)
 
 
 def test_points_behind_the_camera_are_outliers_and_disturb_nothing():

@@ -60,29 +60,33 @@ def test_order_and_repetition_do_not_matter():
     assert pair[0].angular_velocity.tolist() == pair[1].angular_velocity.tolist()
 
 
-def test_what_is_missing_is_told():
-    assert lack(SampleBuffer().between(START, START + 30 * MS)) == ImuReason.NEVER
-    buffer = filled(stamps(400))  # until 997.5 ms
-    not_yet = buffer.between(START + 980 * MS, START + 1010 * MS)
-    assert lack(not_yet) == ImuReason.LATE
-    assert "12.5 ms older than the last row" in str(not_yet)
-    stopped = buffer.between(START + 3 * 10**9, START + 3030 * MS)
-    assert lack(stopped) == ImuReason.STOPPED
-    assert "2.0 s older than the first row" in str(stopped)
-    assert lack(buffer.between(START - 1, START + 30 * MS)) == ImuReason.BEGINS_LATER
-    with_gap = filled([t for t in stamps(400) if not 500 * MS < t - START < 520 * MS])
-    gap = with_gap.between(START + 490 * MS, START + 525 * MS)
-    assert lack(gap) == ImuReason.GAP
-    assert "for 20.0 ms within" in str(gap)
-    assert lack(with_gap.between(START + 530 * MS, START + 560 * MS)) is None
-    # One that is lost can be told from its neighbours, two cannot.
-    for lost, expected in ((1, None), (2, ImuReason.GAP)):
-        some = filled([t for t in stamps(400) if not 0 < t - START - 500 * MS <= lost * PERIOD])
-        found = some.between(START + 490 * MS, START + 525 * MS)
-        assert lack(found) == expected
-    slow = filled(stamps(50, 20 * MS))
-    assert lack(slow.between(START + 100 * MS, START + 130 * MS)) == ImuReason.TOO_SLOW
-    assert lack(filled(stamps(100, 10 * MS)).between(START + 100 * MS, START + 130 * MS)) is None
+EVERY = stamps(400)  # until 997.5 ms
+
+
+def without(first: float, last: float) -> list[int]:
+    """All stamps but those between two times in ms."""
+    return [time for time in EVERY if not first < (time - START) / MS < last]
+
+
+@pytest.mark.parametrize(
+    ("times", "first", "last", "reason", "said"),
+    [
+        ([], 0, 30, ImuReason.NEVER, ""),
+        (EVERY, 980, 1010, ImuReason.LATE, "12.5 ms older than the last row"),
+        (EVERY, 3000, 3030, ImuReason.STOPPED, "2.0 s older than the first row"),
+        (EVERY, -1, 30, ImuReason.BEGINS_LATER, ""),
+        (without(500, 520), 490, 525, ImuReason.GAP, "for 20.0 ms within"),
+        (without(500, 520), 530, 560, None, ""),
+        (without(500, 505), 490, 525, None, ""),  # one that is lost its neighbours tell
+        (without(500, 507), 490, 525, ImuReason.GAP, ""),
+        (stamps(50, 20 * MS), 100, 130, ImuReason.TOO_SLOW, ""),
+        (stamps(100, 10 * MS), 100, 130, None, ""),
+    ],
+)
+def test_what_is_missing_is_told(times, first, last, reason, said):
+    found = filled(times).between(START + first * MS, START + last * MS)
+    assert lack(found) == reason
+    assert said in str(found)
 
 
 def test_a_clock_that_is_set_back_starts_over():
