@@ -63,7 +63,7 @@ class CameraFrames(FrameLocalizer):
 
     def give_pose(self, given: GivenPose) -> None:
         """Find the next frame near this pose; one that a user gives ends the track."""
-        self._pose_prior.take_pose(given)
+        self._pose_prior.given = given
         if not given.lasts:
             self._forget_motion()
 

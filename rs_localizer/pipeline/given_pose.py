@@ -64,33 +64,18 @@ def read_given_pose(message: Any) -> GivenPose:
         MessageError: for numbers that are no pose or no covariance.
     """
     at, q = message.pose.pose.position, message.pose.pose.orientation
-    return _given(
-        stamp_ns(message), message.header.frame_id, getattr(message, "child_frame_id", ""),
-        [at.x, at.y, at.z], [q.x, q.y, q.z, q.w], message.pose.covariance,
-    )  # fmt: skip
-
-
-def _given(
-    stamp: int, frame: str, body: str, position: Any, quaternion: Any, covariance: Any
-) -> GivenPose:
-    """Return a pose of position (3,), quaternion (4,) ``x y z w`` and covariance (36,) or (6,6).
-
-    Raises:
-        MessageError: for numbers that are no pose or no covariance.
-    """
     try:
-        x, y, z = map(float, position)
-        qx, qy, qz, qw = map(float, quaternion)
-        pose = from_numbers((x, y, z), (qx, qy, qz, qw))
-        spread = np.array(covariance, float).reshape(6, 6)
-    except (TypeError, ValueError) as error:
+        pose = from_numbers((at.x, at.y, at.z), (q.x, q.y, q.z, q.w))
+    except TransformError as error:
         raise MessageError(f"the given pose is none: {error}") from error
+    spread = np.array(message.pose.covariance, float).reshape(6, 6)
     if not np.isfinite(spread).all():
         raise MessageError("the covariance of the given pose holds numbers that are not finite")
     if (variances := spread.diagonal()).min() < 0.0:
         raise MessageError(f"the given pose has variances below zero: {variances.tolist()}")
-    names = frame.removeprefix("/"), body.removeprefix("/")
-    return GivenPose(stamp, *names, pose, 0.5 * (spread + spread.T))
+    frame = message.header.frame_id.removeprefix("/")
+    body = getattr(message, "child_frame_id", "").removeprefix("/")
+    return GivenPose(stamp_ns(message), frame, body, pose, 0.5 * (spread + spread.T))
 
 
 class PosePrior:
@@ -105,9 +90,6 @@ class PosePrior:
         self.given: GivenPose | None = None
         """What waits for a frame."""
         self._expected: Prior | None = None
-
-    def take_pose(self, given: GivenPose) -> None:
-        self.given = given
 
     def prior(self, at: Moment, map_frame: str) -> Prior | None:
         """Return the prior of the camera's motion at a time; None if no pose was given."""

@@ -43,8 +43,18 @@ class Landmarks:
         previous = self.map
         if previous is not None and landmarks.equals(previous):
             return  # published again
-        for name, text in oddities_of_map(landmarks, previous).items():
-            self._notice(name, text)
+        if landmarks.dropped:
+            self._notice(
+                Notice.MAP_INCOMPLETE,
+                f"{landmarks.dropped} landmarks are left out: they hold NaN or infinity, or no "
+                "descriptor",
+            )
+        if previous is not None:
+            self._notice(
+                Notice.MAP_REPLACED,
+                f"a map of {len(landmarks)} landmarks in frame {landmarks.frame!r} replaces the "
+                f"one of {len(previous)} in frame {previous.frame!r}",
+            )
         self._matcher, self._last = Matcher(landmarks), None
         modes = landmarks.error_modes
         self.error_modes = None if modes is None else ErrorModes(landmarks.points, modes)
@@ -121,19 +131,3 @@ def read_landmarks(file: str, frame: str) -> Map:
             "nor descriptors"
         )
     return landmarks
-
-
-def oddities_of_map(landmarks: Map, previous: Map | None) -> dict[Notice, str]:
-    """Return sentences on a map that replaces another one, or none."""
-    notices: dict[Notice, str] = {}
-    if landmarks.dropped:
-        notices[Notice.MAP_INCOMPLETE] = (
-            f"{landmarks.dropped} landmarks are left out: they hold NaN or infinity, or no "
-            "descriptor"
-        )
-    if previous is not None:
-        notices[Notice.MAP_REPLACED] = (
-            f"a map of {len(landmarks)} landmarks in frame {landmarks.frame!r} replaces the "
-            f"one of {len(previous)} in frame {previous.frame!r}"
-        )
-    return notices

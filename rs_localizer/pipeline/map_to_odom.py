@@ -22,6 +22,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.integrity import MOST_JUMP
 from rs_localizer.io.transforms import Transform
@@ -63,17 +64,6 @@ class Standing(StrEnum):
     CONTRADICTED = "contradicted"
 
 
-@dataclass(frozen=True, slots=True)
-class Settings:
-    two_d: bool = False  # z, roll and pitch of map -> odom are zero
-    hold: float = 0.0  # s without a pose after which it is given up; 0: never
-
-    @property
-    def axes(self) -> list[int]:
-        """Of the six numbers of a pose, those that it has."""
-        return [0, 1, 5] if self.two_d else [0, 1, 2, 3, 4, 5]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectionState:
     """State between observations; :func:`decide` returns the next one."""
@@ -112,7 +102,7 @@ class Decision:
         return f"{text}; contradicted by poses {far(self.jump)} from there"
 
 
-def decide(settings: Settings, state: CorrectionState, seen: Odometry | FoundPose) -> Decision:
+def decide(config: NodeConfig, state: CorrectionState, seen: Odometry | FoundPose) -> Decision:
     """Decide after an observation; pure: equal arguments give equal decisions."""
     now = seen if isinstance(seen, Odometry) else seen.at
     last = state.held.newest.since if state.held and isinstance(seen, FoundPose) else state.newest
@@ -120,24 +110,33 @@ def decide(settings: Settings, state: CorrectionState, seen: Odometry | FoundPos
         state = CorrectionState(drift=state.drift)
     now, newest = now.after(state.newest)
     state = replace(state, newest=newest)
-    said, case = "", _Case(settings, state, now)
+    said, case = "", _Case(config, state, now)
     if isinstance(seen, FoundPose):
-        pose = carried_pose(now, seen.map_from_body, seen.covariance, settings.axes)
+        pose = carried_pose(now, seen.map_from_body, seen.covariance, case.axes)
         if isinstance(seen, Click):
             state, said = case.clicked(Hypothesis(pose, pose, now.stamp_ns))
         else:
             found = Hypothesis(pose, pose, now.stamp_ns, now.stamp_ns)
             state, said = case.posed(found, seen.doubt)
-    return _Case(settings, state, now).decision(said)
+    return _Case(config, state, now).decision(said)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Case:
     """The rules, for one moment."""
 
-    settings: Settings
+    config: NodeConfig
     state: CorrectionState
     now: Odometry
+
+    @property
+    def axes(self) -> list[int]:
+        """Of the six numbers of a pose, those that it has."""
+        return [0, 1, 5] if self.config.two_d_mode else [0, 1, 2, 3, 4, 5]
+
+    @property
+    def gate(self) -> float:
+        return _GATES[len(self.axes)]
 
     def posed(self, found: Hypothesis, doubt: float) -> tuple[CorrectionState, str]:
         """Return the state after a pose, probably right or not, and the sentence to say."""
@@ -206,8 +205,8 @@ class _Case:
             return Decision(state, Standing.LOST, None, grown, seconds=seconds, said=said)
         fresh = 1e-9 * (self.now.stamp_ns - held.seen_ns) < _FRESH
         standing, jump = Standing.TRACKING if fresh else Standing.HELD, None
-        axes, spread = self.settings.axes, self._grown(held.pose) + held.pose.covariance
-        smallest = least_jump(spread, axes, _GATES[len(axes)])
+        spread = self._grown(held.pose) + held.pose.covariance
+        smallest = least_jump(spread, self.axes, self.gate)
         if aside is not None:  # room for what may be as well
             off = held.pose.offset(aside.pose, self.now)
             grown = grown + np.outer(off, off)
@@ -220,7 +219,7 @@ class _Case:
     @property
     def held(self) -> Hypothesis | None:
         """Hypothesis that is held and not given up."""
-        held, hold = self.state.held, self.settings.hold
+        held, hold = self.state.held, self.config.hold
         ended = held is not None and 0.0 < hold < held.newest.seconds(self.now)
         return None if ended else held
 
@@ -233,7 +232,7 @@ class _Case:
 
     @property
     def _drift(self) -> tuple[Drift, list[int]]:
-        return self.state.drift, self.settings.axes
+        return self.state.drift, self.axes
 
     def _grown(self, pose: CarriedPose) -> Array:
         return pose.grown(self.now, *self._drift)
@@ -247,16 +246,15 @@ class _Case:
         return distance, distance + float(np.linalg.slogdet(spread)[1])
 
     def _spread(self, known: Hypothesis, found: Hypothesis) -> Array:
-        axes = self.settings.axes
-        spread: Array = (self._grown(known.pose) + found.pose.covariance)[np.ix_(axes, axes)]
-        return spread
+        spread = self._grown(known.pose) + found.pose.covariance
+        return spread[np.ix_(self.axes, self.axes)]
 
     def _distance(self, offset: Array, spread: Array) -> float:
-        own = offset[self.settings.axes]
+        own = offset[self.axes]
         return float(own @ np.linalg.solve(spread, own))
 
     def _passes(self, misfit: tuple[float, float]) -> bool:
-        return misfit[0] <= _GATES[len(self.settings.axes)]
+        return misfit[0] <= self.gate
 
     def _stays(self, aside: Hypothesis, found: Hypothesis) -> bool:
         """Return whether a hypothesis outlasts a pose elsewhere."""
@@ -268,8 +266,7 @@ class _Case:
 
     def _reachable(self, held: Hypothesis, aside: Hypothesis | None, found: Hypothesis) -> bool:
         """Return whether a body can have got from the last pose to a new one, despite odometry."""
-        gate = _GATES[len(self.settings.axes)]
-        if aside and aside.told and not (aside.reachable and self._near(aside, found, gate)):
+        if aside and aside.told and not (aside.reachable and self._near(aside, found, self.gate)):
             return False
         return self._near(held, found, _SLACK)
 

@@ -27,104 +27,78 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.io.outputs import BodyPose, Localized, Twist
 from rs_localizer.io.transforms import NotYetError, Transform, TransformError, Transforms
 from rs_localizer.pipeline.carried_pose import FoundPose, Odometry
-from rs_localizer.pipeline.map_to_odom import CorrectionState, Settings, decide
+from rs_localizer.pipeline.map_to_odom import CorrectionState, decide
 from rs_localizer.pipeline.refusal import Refusal
 
 _LINEAR, _ANGULAR = slice(0, 3), slice(3, 6)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Mounting:
-    """Mounting of the base on the camera at one moment."""
-
-    camera_from_base: Transform
-    linear: Array  # (3,) m/s, of the base's origin with respect to the camera, in camera axes
-    angular: Array  # (3,) rad/s, of the base with respect to the camera, in base axes
-
-
-def find_mounting(
-    transforms: Transforms, camera: str, base: str, stamp_ns: int | None, span_ns: int
-) -> Mounting:
-    """Return the mount at a time, from the transforms between two frames.
-
-    Args:
-        transforms: where they come from.
-        camera: optical frame of the camera.
-        base: frame of the body.
-        stamp_ns: the moment; None: the latest.
-        span_ns: of a mounting that moves, the velocity is that between half of this before and
-            half of it after; 0: it is not asked for, and zero.
-
-    Raises:
-        TransformError: when the transform is not known for that time.
-    """
-    now = transforms.lookup(camera, base, stamp_ns)
-    if stamp_ns is None or span_ns < 2 or not transforms.moves(camera, base):
-        return Mounting(now, np.zeros(3), np.zeros(3))
-    half_ns = span_ns // 2
-    before = transforms.lookup(camera, base, stamp_ns - half_ns)
-    after = transforms.lookup(camera, base, stamp_ns + half_ns)
-    seconds = 2e-9 * half_ns
-    turn = np.ascontiguousarray(before.rotation.T @ after.rotation)
-    return Mounting(
-        now, (after.translation - before.translation) / seconds, so3.log(turn) / seconds
-    )
-
-
-def base_pose(camera: BodyPose, mounting: Mounting) -> BodyPose:
-    """Return the pose of the base in the map, from the pose of the camera."""
-    lever = camera.rotation @ mounting.camera_from_base.translation
-    jacobian = np.eye(6)
-    jacobian[_LINEAR, _ANGULAR] = -so3.hat(lever)
-    return BodyPose(
-        position=camera.position + lever,
-        rotation=camera.rotation @ mounting.camera_from_base.rotation,
-        covariance=_propagate(jacobian, camera.covariance),
-    )
-
-
-def base_twist(camera: Twist, mounting: Mounting) -> Twist:
-    """Return the velocity of the base in the map, in base axes, from that of the camera."""
-    base_from_camera = mounting.camera_from_base.rotation.T
-    lever = mounting.camera_from_base.translation
-    linear = camera.linear + np.cross(camera.angular, lever) + mounting.linear
-    jacobian = np.zeros((6, 6))
-    jacobian[_LINEAR, _LINEAR] = jacobian[_ANGULAR, _ANGULAR] = base_from_camera
-    jacobian[_LINEAR, _ANGULAR] = -base_from_camera @ so3.hat(lever)
-    return Twist(
-        linear=base_from_camera @ linear,
-        angular=base_from_camera @ camera.angular + mounting.angular,
-        covariance=_propagate(jacobian, camera.covariance),
-    )
-
-
-def _propagate(jacobian: Array, covariance: Array) -> Array:
-    result: Array = jacobian @ covariance @ jacobian.T
-    return 0.5 * (result + result.T)  # rounding must not cost the symmetry
 
 
 def of_body(
     localized: Localized, config: NodeConfig, transforms: Transforms
 ) -> Localized | Refusal:
     """Return the result of ``base_frame`` from the result of the camera."""
-    base = config.base_frame
-    if base in ("", localized.body_frame):
+    camera, base = localized.body_frame, config.base_frame
+    if base in ("", camera):
         return localized
     # Without a time the latest transform is used, as everywhere in TF.
     timed = min(localized.input_stamp_ns, localized.stamp_ns) > 0
-    stamp_ns = localized.stamp_ns if timed else None
-    span_ns = round(localized.estimate.span * 1e9) if localized.twist else 0
+    stamp_ns, twist = localized.stamp_ns if timed else None, localized.twist
     try:
-        mounting = find_mounting(transforms, localized.body_frame, base, stamp_ns, span_ns)
+        mount, velocities = transforms.lookup(camera, base, stamp_ns), (np.zeros(3), np.zeros(3))
+        half_ns = round(0.5e9 * localized.estimate.span) if twist and timed else 0
+        if half_ns and transforms.moves(camera, base):
+            before, after = (
+                transforms.lookup(camera, base, localized.stamp_ns + side * half_ns)
+                for side in (-1, 1)
+            )
+            velocities = _between(before, after, 2e-9 * half_ns)
     except TransformError as error:
-        text = f"from the camera {localized.body_frame!r} to base_frame {base!r}: {error}"
+        text = f"from the camera {camera!r} to base_frame {base!r}: {error}"
         return Refusal(Reason.NO_TRANSFORM, text)
-    return replace(
-        localized,
-        body_frame=base,
-        pose=base_pose(localized.pose, mounting),
-        twist=base_twist(localized.twist, mounting) if localized.twist else None,
+    pose = base_pose(localized.pose, mount)
+    twist = None if twist is None else base_twist(twist, mount, *velocities)
+    return replace(localized, body_frame=base, pose=pose, twist=twist)
+
+
+def _between(before: Transform, after: Transform, seconds: float) -> tuple[Array, Array]:
+    """Return the velocities ``r'`` and ``u`` from one ``camera_from_base`` to another."""
+    turn = so3.log(np.ascontiguousarray(before.rotation.T @ after.rotation))
+    return (after.translation - before.translation) / seconds, turn / seconds
+
+
+def base_pose(camera: BodyPose, mount: Transform) -> BodyPose:
+    """Return the pose of the base in the map, from the pose of the camera."""
+    lever, jacobian = camera.rotation @ mount.translation, np.eye(6)
+    jacobian[_LINEAR, _ANGULAR] = -so3.hat(lever)
+    return BodyPose(
+        camera.position + lever,
+        camera.rotation @ mount.rotation,
+        _propagate(jacobian, camera.covariance),
     )
+
+
+def base_twist(camera: Twist, mount: Transform, moving: Array, turning: Array) -> Twist:
+    """Return the velocity of the base in the map, in base axes, from that of the camera.
+
+    Args:
+        moving: (3,) ``r'``, m/s.
+        turning: (3,) ``u``, rad/s.
+    """
+    base_from_camera, lever = mount.rotation.T, mount.translation
+    linear = camera.linear + np.cross(camera.angular, lever) + moving
+    jacobian = np.zeros((6, 6))
+    jacobian[_LINEAR, _LINEAR] = jacobian[_ANGULAR, _ANGULAR] = base_from_camera
+    jacobian[_LINEAR, _ANGULAR] = -base_from_camera @ so3.hat(lever)
+    return Twist(
+        base_from_camera @ linear,
+        base_from_camera @ camera.angular + turning,
+        _propagate(jacobian, camera.covariance),
+    )
+
+
+def _propagate(jacobian: Array, covariance: Array) -> Array:
+    result: Array = jacobian @ covariance @ jacobian.T
+    return 0.5 * (result + result.T)  # rounding must not cost the symmetry
 
 
 def is_mounting_late(transforms: Transforms, camera: str, base: str, time_ns: int) -> bool:
@@ -194,7 +168,7 @@ def broadcast(
     if config.publish_tf == PublishTf.MAP_TO_CAMERA:
         return pose_transform(frame), state
     pose = pose_in_odometry(frame, config, transforms)
-    decision = decide(Settings(config.two_d_mode, config.hold), state, pose)
+    decision = decide(config, state, pose)
     if (correction := decision.map_from_odom) is None:
         return None, decision.state
     ahead_ns = frame.stamp_ns + round(config.transform_tolerance * 1e9)

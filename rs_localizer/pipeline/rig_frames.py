@@ -17,10 +17,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_localizer.config import NodeConfig, PoseTime
-from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.core.rig import ByCamera, Rig, RigEstimate
@@ -157,30 +155,25 @@ class FrameAssembler:
         self._notice(Notice.NO_IMAGES, f"{name} is left out: {why}")
 
 
-def matches_of(cloud: Correspondences, images: Sequence[CameraImage]) -> tuple[Array, ...]:
-    """Return points and pixels of an image, with scores if all images have them."""
-    if any(image.cloud.scores is None for image in images):
-        return cloud.points, cloud.pixels
-    assert cloud.scores is not None
-    return cloud.points, cloud.pixels, cloud.scores
-
-
 def joined(names: Sequence[str], images: Sequence[CameraImage]) -> Correspondences:
-    """Join correspondences of all images, with the stamp of the first; ``names``: all cameras."""
-    dropped = sum(image.cloud.dropped for image in images)
-    return replace(images[0].cloud, table=_table(names, images), dropped=dropped)
+    """Join correspondences of all images, with the stamp of the first one.
 
+    Its rows have the fields that all have, and their camera.
 
-def _table(names: Sequence[str], images: Sequence[CameraImage]) -> NDArray[Any]:
-    """Return the rows of all images, with the fields that all have, and their camera."""
-    tables = [image.cloud.table for image in images]
-    known = [table.dtype.names or () for table in tables]
-    fields = [name for name in known[0] if all(name in others for others in known)]
+    Args:
+        names: of all cameras of the rig.
+    """
+    clouds = [image.cloud for image in images]
+    tables = [cloud.table for cloud in clouds]
+    fields = [
+        name for name in tables[0].dtype.names or () if all(name in it.dtype.names for it in tables)
+    ]
     columns = [np.concatenate([table[name] for table in tables]) for name in fields]
     kinds = [(name, of.dtype.newbyteorder("<")) for name, of in zip(fields, columns, strict=True)]
     places = [names.index(image.camera) for image in images]
     columns.append(np.repeat(places, [len(table) for table in tables]))
-    return make_rows([*kinds, ("camera", "u1")], columns)
+    table = make_rows([*kinds, ("camera", "u1")], columns)
+    return replace(clouds[0], table=table, dropped=sum(cloud.dropped for cloud in clouds))
 
 
 def share_of(image: CameraImage, result: RigEstimate) -> CameraShare:
@@ -310,7 +303,12 @@ class RigFrames(FrameLocalizer):
         # Seconds since the first image: nothing is lost of stamps since 1970.
         origin_ns = images[0].start_ns
         starts = {image.camera: 1e-9 * (image.start_ns - origin_ns) for image in images}
-        matches = {image.camera: matches_of(image.cloud, images) for image in images}
+        parts = ["points", "pixels"]
+        if all(image.cloud.scores is not None for image in images):
+            parts.append("scores")
+        matches = {
+            image.camera: tuple(getattr(image.cloud, part) for part in parts) for image in images
+        }
         context = FrameContext(error_modes=self._landmarks.error_modes)
         result = self._tracker.localize(origin_ns, matches, stamps=starts, context=context)
         if not result:

@@ -1,11 +1,9 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of the launch files: every setting is an argument, and a wrong one ends the launch."""
+"""Parts of the launch files: every setting is an argument, and a wrong value ends the launch."""
 
-import sys
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription  # type: ignore[attr-defined]  # not our folder of this name
-from rs_localizer.config import NO_NAMES, DetectorConfig, NodeConfig, meant
+from rs_localizer.config import NO_NAMES, DetectorConfig, NodeConfig
 from rs_localizer.io.reading import YamlError, load_yaml
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMapError
@@ -62,9 +60,7 @@ def description(
         "rviz": ("false", "start RViz with a view of the outputs, too"),
         **(others or {}),
     }
-    known: dict[str, Any] = {}  # some with dots, too
     for kind in (NodeConfig, *kinds):
-        known |= settings(kind)
         file = share("config", f"{NODES[kind]}.yaml")
         own[_file_of(kind)] = (file, f"parameters of {NODES[kind]}")
         for name, one in settings(kind).items():
@@ -75,43 +71,12 @@ def description(
         arguments=["-d", share("config", "rs_localizer.rviz")],
         condition=IfCondition(LaunchConfiguration("rviz")),
     )  # fmt: skip
-
-    def start(context: Any) -> list[Node]:
-        if _is_launched():
-            refuse_unknown(context.argv, {**own, **known})
-        return nodes(context.launch_configurations)
-
-    return LaunchDescription(
-        [
-            *(
-                DeclareLaunchArgument(name, default_value=default, description=text)
-                for name, (default, text) in own.items()
-            ),
-            rviz,
-            OpaqueFunction(function=start),
-        ]
+    arguments = (
+        DeclareLaunchArgument(name, default_value=default, description=text)
+        for name, (default, text) in own.items()
     )
-
-
-def _is_launched() -> bool:
-    """Return True if a file of this package is launched, and not included by another one.
-
-    Arguments of such a file may be its own, and nobody tells which it has.
-    """
-    for before, word in pairwise(("", *sys.argv)):
-        if word.endswith(".launch.py"):
-            return PACKAGE in (before, Path(word).absolute().parent.parent.name)
-    return False
-
-
-def refuse_unknown(words: Iterable[str], own: Iterable[str]) -> None:
-    """Raise ``ValueError`` for ``name:=value`` of a name that is none of a launch file's own."""
-    names = list(own)
-    for word in words:
-        name, given, _ = word.partition(":=")
-        if given and name not in names:
-            text = meant(name, names) or "; --show-args lists those that there are"
-            raise ValueError(f"{name} is no argument of this launch file{text}")
+    start = OpaqueFunction(function=lambda context: nodes(context.launch_configurations))
+    return LaunchDescription([*arguments, rviz, start])
 
 
 def _file_of(kind: Kind) -> str:
@@ -144,7 +109,7 @@ def node(
     kind: Kind,
     remappings: Mapping[str, str] | None = None,
     values: Mapping[str, Any] | None = None,
-    **options: Any,
+    namespace: str | None = None,
 ) -> Node:
     """Return a node of this package; when it ends, everything does.
 
@@ -153,7 +118,7 @@ def node(
         kind: of its settings.
         remappings: of its topics.
         values: settings instead of those that were given.
-        options: of launch_ros' Node.
+        namespace: instead of the one that was given.
 
     Raises:
         ValueError: for a params file that is not there.
@@ -167,18 +132,13 @@ def node(
              for k, v in chosen.items()}  # fmt: skip
     typed["use_sim_time"] = texts["use_sim_time"].lower() == "true"
     name = NODES[kind]
-    settled: dict[str, Any] = {
-        "package": PACKAGE,
-        "executable": "localizer" if kind is NodeConfig else name,
-        "name": name,
-        "namespace": texts["namespace"],
-        "parameters": [file, typed],
-        "remappings": list((remappings or {}).items()),
-        "arguments": ["--ros-args", "--log-level", texts["log_level"]],
-        "output": "screen",
-        "on_exit": Shutdown(reason=f"{name} has ended"),
-    }
-    return Node(**{**settled, **options})
+    return Node(
+        package=PACKAGE, executable="localizer" if kind is NodeConfig else name, name=name,
+        namespace=texts["namespace"] if namespace is None else namespace,
+        parameters=[file, typed], remappings=list((remappings or {}).items()),
+        arguments=["--ros-args", "--log-level", texts["log_level"]],
+        output="screen", on_exit=Shutdown(reason=f"{name} has ended"),
+    )  # fmt: skip
 
 
 def from_camera(texts: Texts, kind: Kind, values: Mapping[str, Any] | None = None) -> list[Node]:

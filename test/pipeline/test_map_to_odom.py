@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rs_localizer.config import NodeConfig
 from rs_localizer.io.transforms import Transform
 from rs_localizer.pipeline.carried_pose import Click, FoundPose, Odometry
-from rs_localizer.pipeline.map_to_odom import CorrectionState, Decision, Settings, Standing, decide
+from rs_localizer.pipeline.map_to_odom import CorrectionState, Decision, Standing, decide
 
 SECOND = 10**9
 SPREAD = (0.01, 0.005)  # m, rad, of each axis of a pose
@@ -33,8 +34,8 @@ class Drive:
     ) -> None:
         self.rng, self.scale, self.turn = np.random.default_rng(seed), scale, turn
         self.body, self.odom, self.time = place(0, 0, 0), place(5, 3, 1.0), 10.0
-        self.settings, self.decision = Settings(**settings), decide(
-            Settings(**settings), CorrectionState(), Odometry(0, place(5, 3, 1.0))
+        self.settings, self.decision = NodeConfig(**settings), decide(
+            NodeConfig(**settings), CorrectionState(), Odometry(0, place(5, 3, 1.0))
         )  # fmt: skip
         self.said: list[str] = []
         self.standings: Counter[Standing] = Counter()
@@ -99,7 +100,7 @@ class Drive:
 
 @pytest.mark.parametrize("two_d", [False, True])
 def test_an_hour_of_right_poses_trips_no_rule(two_d):
-    drive = Drive(two_d=two_d)
+    drive = Drive(two_d_mode=two_d)
     drive.go(3600.0, rate=3.0)
     assert drive.said == []
     assert set(drive.standings) == {Standing.TRACKING}
@@ -272,7 +273,7 @@ def test_it_is_held_for_ever_or_as_long_as_is_wanted():
     assert str(drive.decision).startswith("not sent since hold ended, 2.1 s after the last frame, ")
     drive.take(drive.pose())
     assert drive.decision.standing is Standing.TRACKING
-    assert str(decide(Settings(), CorrectionState(), drive.at)) == "lost"
+    assert str(decide(NodeConfig(), CorrectionState(), drive.at)) == "lost"
 
 
 def test_a_recording_that_starts_over_is_no_jump():
@@ -356,7 +357,7 @@ def test_in_the_plane_the_body_has_its_x_and_y_and_heading(two_d):
     )
     odometry, covariance = place(-1.0, 2.0, 0.4), np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     seen = FoundPose(Odometry(SECOND, odometry), tilted, covariance)
-    decision = decide(Settings(two_d=two_d), CorrectionState(), seen)
+    decision = decide(NodeConfig(two_d_mode=two_d), CorrectionState(), seen)
     body, flat = decision.map_from_odom @ odometry, place(3.0, 4.0, 0.7)
     expected = flat if two_d else tilted
     assert body.translation == pytest.approx(expected.translation)

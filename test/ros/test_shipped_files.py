@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Launch files and views name what the node has; they are run by hand where ROS is installed."""
 
-import contextlib
 import json
 import re
 import runpy
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -94,7 +93,7 @@ Describe = Callable[..., list[Piece]]
 
 @pytest.fixture
 def describe(monkeypatch) -> Describe:
-    """All of a launch file when these arguments are given, or typed as ``words``."""
+    """All of a launch file when these arguments are given."""
     for name in (
         *("launch", "launch.actions", "launch.conditions", "launch.substitutions", "launch_ros"),
         *("launch_ros.actions", "launch_ros.substitutions", "launch_ros.parameter_descriptions"),
@@ -102,12 +101,12 @@ def describe(monkeypatch) -> Describe:
         monkeypatch.setitem(sys.modules, name, Fake(name))
     monkeypatch.delitem(sys.modules, "rs_localizer.ros.launching", raising=False)
 
-    def describe(file: str, words: Sequence[str] = (), **given: str) -> list[Piece]:
+    def describe(file: str, **given: str) -> list[Piece]:
         code = runpy.run_path(str(ROOT / "launch" / file))
         found = pieces(code["generate_launch_description"]())
         defaults = declared(found)
         assert given.keys() <= defaults.keys()
-        context = SimpleNamespace(launch_configurations=defaults | given, argv=words)
+        context = SimpleNamespace(launch_configurations=defaults | given)
         for piece in list(found):
             if piece.kind == "OpaqueFunction":
                 found += pieces(piece.options["function"](context))
@@ -206,22 +205,6 @@ def test_the_localizer_knows_how_well_a_board_is_known(describe, tmp_path):
 def test_what_cannot_be_started_fails_before_anything_is(describe, file, given, text):
     with pytest.raises(ValueError, match=text):
         describe(file, **(MAP.get(file, {}) | given))
-
-
-@pytest.mark.parametrize(
-    ("typed", "own", "text"),
-    [
-        ("rs_localizer localizer.launch.py", "readout_tme:=0.03", "did you mean readout_time"),
-        ("/opt/share/rs_localizer/launch/localizer.launch.py", "xyz:=3", "--show-args lists"),
-        ("rs_localizer localizer.launch.py", "readout_time:=0.03", ""),
-        ("rs_localizer localizer.launch.py", "velocity_prior.angular:=0.5", ""),
-        ("robot bringup.launch.py", "readout_tme:=0.03", ""),  # it may be an argument of theirs
-    ],
-)
-def test_an_argument_that_there_is_not_ends_the_launch(describe, monkeypatch, typed, own, text):
-    monkeypatch.setattr(sys, "argv", ["ros2", "launch", *typed.split(), own])
-    with pytest.raises(ValueError, match=text) if text else contextlib.nullcontext():
-        describe("localizer.launch.py", words=[own])
 
 
 def test_each_camera_of_a_rig_has_a_detector_in_its_namespace(describe):

@@ -7,7 +7,6 @@ It listens to images only while somebody listens to it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -33,26 +32,10 @@ from rs_localizer.ros.node.diagnostics import (
 )
 from rs_localizer.ros.node.managed import ManagedNode
 from rs_localizer.ros.node.statistics import WINDOW, Summary
-from rs_localizer.ros.node.subscriptions import Silence, Topic
+from rs_localizer.ros.node.subscriptions import Topic
 
 Result = TypeVar("Result")
 Picture = NDArray[np.uint8]  # (h,w,3) blue, green, red
-
-
-def judge(summary: Summary, silence: Mapping[str, Silence], oddities: Mapping[str, str]) -> Health:
-    """Return the health of an active node with listeners: ``waiting for images``, ``detecting``."""
-    causes = [f"{item.topic}: {item.cause}" for item in silence.values() if item.cause]
-    if causes or not silence:
-        message = "; ".join([f"{State.WAITING} images", *causes])
-        return Health(Level.WARN, State.WAITING, message, subject="images")
-    message = hindrance(summary, "images")
-    if "refused" in message:
-        message += f": {', '.join(sorted(summary.recent_reasons))}"
-    if message := message or one_line(oddities):
-        return Health(Level.WARN, State.DETECTING, message)
-    last = summary.last
-    message = "no image has been looked at yet" if last is None else last.text
-    return Health(Level.OK, State.DETECTING, message)
 
 
 # Types of the topics whose messages are looked at.
@@ -131,13 +114,25 @@ class ImageNode(ManagedNode[Settings, Result], Generic[Settings, Result]):
 
     def examine(self) -> tuple[Health, str]:
         summary = self.statistics.summary()
-        judgement = out_of_service(self.state)
-        if judgement is None and not self._listening:
+        health = out_of_service(self.state) or self._health(summary)
+        return health.with_values(counts(summary, "Images", "Images done")), ""
+
+    def _health(self, summary: Summary) -> Health:
+        """Return the health of an active node."""
+        if not self._listening:
             message = f"no subscription to the {self.output} or the debug image"
-            judgement = Health(Level.OK, State.IDLE, message)
-        if judgement is None:
-            judgement = judge(summary, self.silence, self.refusals.recent(self.odd, WINDOW))
-        return judgement.with_values(counts(summary, "Images", "Images done")), ""
+            return Health(Level.OK, State.IDLE, message)
+        causes = [f"{it.topic}: {it.cause}" for it in self.silence.values() if it.cause]
+        if causes:
+            message = "; ".join([f"{State.WAITING} images", *causes])
+            return Health(Level.WARN, State.WAITING, message, subject="images")
+        message = hindrance(summary, "images")
+        if "refused" in message:
+            message += f": {', '.join(sorted(summary.recent_reasons))}"
+        if message := message or one_line(self.refusals.recent(self.odd, WINDOW)):
+            return Health(Level.WARN, State.DETECTING, message)
+        message = "no image has been looked at yet" if summary.last is None else summary.last.text
+        return Health(Level.OK, State.DETECTING, message)
 
     # -- who listens ------------------------------------------------------------------------
 

@@ -20,7 +20,7 @@ from rs_localizer.io.topics import LIVE, MAP_TO_ODOM
 from rs_localizer.io.transforms import NotYetError, Transform, TransformError, make_transform
 from rs_localizer.pipeline.carried_pose import Click, FoundPose, Odometry
 from rs_localizer.pipeline.given_pose import GivenPose
-from rs_localizer.pipeline.map_to_odom import CorrectionState, Decision, Settings, Standing, decide
+from rs_localizer.pipeline.map_to_odom import CorrectionState, Decision, Standing, decide
 from rs_localizer.pipeline.published import Broadcast, pose_in_odometry, pose_transform
 from rs_localizer.ros.localizer.rivals import Rivals
 from rs_localizer.ros.localizer.tf import Tf, import_tf2_ros, needed
@@ -119,8 +119,9 @@ class Broadcaster:
     def fault(self) -> dict[str, str]:
         """Say for the diagnostics why nothing has been sent lately that should have been."""
         (when, text), since = self._failed, time.monotonic() - WINDOW
-        missing = when >= since > self._sent
-        return ({Notice.NOT_BROADCAST: text} if missing else {}) | self._rivals.static
+        missing, static = when >= since > self._sent, self._rivals.static
+        faults: dict[str, str] = {Notice.NOT_BROADCAST: text} if missing else {}
+        return faults | ({Notice.SECOND_BROADCASTER: static} if static else {})
 
     @property
     def values(self) -> dict[str, str]:
@@ -157,7 +158,7 @@ class Broadcaster:
     def give(self, given: GivenPose) -> None:
         """Take a pose that a user gives, for ``map_to_odom``."""
         if self._corrects:
-            self._await(lambda last: self._asked(given, last))
+            self._await(lambda last: self._click(given, last))
 
     def _await(self, take: Callable[[bool], None]) -> None:
         with self._sending:
@@ -166,12 +167,12 @@ class Broadcaster:
 
     def _hear(self, transforms: list[Any], static: bool) -> None:
         for item in transforms:
-            self._judge(item, static)
+            self._tell_rival(item, static)
         self._flush()
 
-    def _judge(self, item: Any, static: bool) -> None:
-        for notice, text in self._rivals.hear(item, self.decision, static=static).items():
-            self._refusals.notice(notice, text)
+    def _tell_rival(self, item: Any, static: bool) -> None:
+        if text := self._rivals.hear(item, self.decision, static=static):
+            self._refusals.notice(Notice.SECOND_BROADCASTER, text)
 
     def _flush(self) -> None:
         with self._sending:
@@ -201,33 +202,26 @@ class Broadcaster:
         self._body = frame.body_frame
         self._hold()
 
-    def _asked(self, given: GivenPose, last: bool) -> None:
-        """Take a given pose, or say what hinders that."""
+    def _click(self, given: GivenPose, last: bool) -> None:
+        """Take a given pose, and answer."""
         try:
-            self._click(given, last)
+            text = self._clicked(given, last)
         except NotYetError:
             raise
         except TransformError as error:
-            self._reply(f"refused: {error}")
-
-    def _click(self, given: GivenPose, last: bool) -> None:
-        """Take a given pose, and answer."""
-        config, body, frame = self._config, given.body or self._body, given.frame
-        if not body:
-            text = "refused: set base_frame, of which it is the pose"
-        elif frame in (config.odom_frame, body) or self._map_frame not in ("", frame):
-            known = self._map_frame or config.map_frame
-            text = f"refused: it is in {frame!r}, the map is {known!r}"
-        else:
-            text = self._clicked(given, body, last)
-        self._reply(text)
-
-    def _reply(self, text: str) -> None:
+            text = f"refused: {error}"
         self._answer = f"{text} ({time.strftime('%H:%M:%S')})"
         self._refusals.notice(Notice.POSE_GIVEN, text)
 
-    def _clicked(self, given: GivenPose, body: str, last: bool) -> str:
-        late, stamp, odom_frame = "", given.stamp_ns or None, self._config.odom_frame
+    def _clicked(self, given: GivenPose, last: bool) -> str:
+        """Take a given pose, if possible; return the answer."""
+        odom_frame, body, frame = self._config.odom_frame, self._body, given.frame
+        if not body:
+            return "refused: set base_frame, of which it is the pose"
+        if frame in (odom_frame, body) or self._map_frame not in ("", frame):
+            known = self._map_frame or self._config.map_frame
+            return f"refused: it is in {frame!r}, the map is {known!r}"
+        late, stamp = "", given.stamp_ns or None
         try:
             odom = self.tf.lookup(odom_frame, body, stamp)
         except TransformError as error:
@@ -236,7 +230,7 @@ class Broadcaster:
             late, stamp = f"; odometry does not know its time: {error}", None
         if stamp is None:
             stamp, odom = self._newest(body)
-        self._body, self._map_frame = body, given.frame
+        self._map_frame = frame
         said = self._begin(Click(Odometry(stamp, odom), given.pose, given.allowed)).said
         self._hold()
         return said + late
@@ -256,10 +250,9 @@ class Broadcaster:
         return decision
 
     def _decide(self, seen: Odometry | FoundPose) -> Decision:
-        settings = Settings(self._config.two_d_mode, self._config.hold)
-        self.decision = decision = decide(settings, self._state, seen)
-        self._state = decision.state
-        return decision
+        self.decision = decide(self._config, self._state, seen)
+        self._state = self.decision.state
+        return self.decision
 
     def _tick(self) -> None:
         with self._sending:
@@ -304,11 +297,10 @@ class Broadcaster:
         other = self._rivals.parent(item)
         if other != item.parent:
             advice = (
-                "end the node that sends that"
-                if self._corrects
-                else "choose publish_tf map_to_odom, or the root of the camera's frames as "
-                "base_frame"
+                "choose publish_tf map_to_odom, or the root of the camera's frames as base_frame"
             )
+            if self._corrects:
+                advice = "end the node that sends that"
             raise TransformError(f"TF frame {item.child!r} already has parent {other!r}; {advice}")
         message = make_transform(
             make_message, item.stamp_ns, item.parent, item.child, item.parent_from_child
@@ -316,5 +308,5 @@ class Broadcaster:
         early = self._rivals.send(message)
         self._broadcaster.sendTransform(message)
         if early is not None:
-            self._judge(early, True)
+            self._tell_rival(early, True)
         self._sent = time.monotonic()

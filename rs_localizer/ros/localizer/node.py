@@ -258,14 +258,13 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
 
     def _take_sample(self, item: Input, message: Any) -> None:
         """Use a reading at once; frames wait for them."""
-        assert self._frames is not None and self.worker is not None  # noqa: PT018
+        assert self._frames is not None
         if self._frames.config.imu.use == ImuUse.NONE:
             return
         refusal = item.take_message(self._frames, message)
         if isinstance(refusal, Refusal):
             self.refusals.add(refusal.reason, refusal.detail)
             return
-        self.worker.look()
         if self._needs_tf and self._frames.aid.frame != self._frames.camera_frame:
             self._needs_tf = False
             self._broadcaster.tf.listen("the IMU")

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from rs_localizer.core.reasons import Notice
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.transforms import Transform, TransformError, read_transform
 from rs_localizer.pipeline.carried_pose import PLACE, TURN, far
@@ -40,8 +39,8 @@ class Rivals:
         self._until: dict[str, float] = {}  # time.monotonic() until which others have ours
         self._static: dict[str, str] = {}  # parents of those that are, by child
         self._early: dict[Link, Any] = {}  # static ones, which come once, before we send
-        self.static: dict[str, str] = {}
-        """What contradicts for ever, by notice."""
+        self.static = ""
+        """What contradicts for ever, one sentence; empty: nothing does."""
 
     def parent(self, item: Broadcast) -> str:
         """Return the parent that others give this child; its own if nobody does."""
@@ -62,8 +61,8 @@ class Rivals:
                 self._sent.popitem(last=False)
             return self._early.pop(link, None)
 
-    def hear(self, message: Any, decision: Decision | None, *, static: bool) -> dict[str, str]:
-        """Return what is wrong with a TransformStamped that has come, by notice.
+    def hear(self, message: Any, decision: Decision | None, *, static: bool) -> str:
+        """Return what is wrong with a TransformStamped that has come, one sentence or nothing.
 
         Args:
             message: it.
@@ -78,11 +77,8 @@ class Rivals:
                 text = self._two_parents(*link, static)
                 if static:
                     self._early[link] = message
-        if not text:
-            return {}
-        found: dict[str, str] = {Notice.SECOND_BROADCASTER: text}
-        self.static |= found if static else {}
-        return found
+        self.static = text if static and text else self.static
+        return text
 
     def _rival(self, message: Any, link: Link, decision: Decision | None, static: bool) -> str:
         if (stamp_ns(message), _numbers(message)) in self._sent:

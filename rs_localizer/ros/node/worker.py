@@ -26,7 +26,7 @@ they come.
 
 _NAME = "rs_localizer worker"
 # Interval (s) at which waiting frames are looked at, and how many may wait.
-_LOOK_PERIOD = 0.005
+_LOOK_PERIOD = 0.002
 _MOST_WAITING = 100
 
 
@@ -66,11 +66,11 @@ class Worker(Generic[Result]):
     ) -> None:
         self._work, self._publish, self._patience = work, publish, patience
         self._statistics, self._failed = statistics, failed
-        self._changed = threading.Condition()  # of the next five
+        self._changed = threading.Condition()  # of the next four
         self._updates: dict[str, Callable[[], None]] = {}
         self._frames: dict[str, _Arrival] = {}
         self._session = 0
-        self._closed = self._woken = False
+        self._closed = False
         self._waiting: deque[_Arrival] = deque()  # the thread's: frames that lack something
         # Held while publishing: after pause() nothing comes any more.
         self._publishing = threading.Lock()
@@ -100,13 +100,6 @@ class Worker(Generic[Result]):
         if replaced:
             self._statistics.replaced()
 
-    def look(self) -> None:
-        """Look again at waiting frames: something has come."""
-        if self._waiting:
-            with self._changed:
-                self._woken = True
-                self._changed.notify()
-
     def pause(self) -> None:
         """Forget the frames so far, the one that is worked on included."""
         with self._publishing, self._changed:
@@ -132,10 +125,7 @@ class Worker(Generic[Result]):
         """Wait for something to do, apply updates and take a frame; False at the end."""
         timeout = 0.0 if self._is_ready() else _LOOK_PERIOD if self._waiting else None
         with self._changed:
-            self._changed.wait_for(
-                lambda: self._updates or self._frames or self._closed or self._woken, timeout
-            )
-            self._woken = False
+            self._changed.wait_for(lambda: self._updates or self._frames or self._closed, timeout)
             updates, self._updates = self._updates, {}
             if oldest := next(iter(self._frames), None):
                 self._waiting.append(self._frames.pop(oldest))

@@ -13,7 +13,6 @@ from sensor_msgs.msg import Image
 
 from rs_localizer.core.reasons import Reason
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.ros.node import worker as worker_module
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import Statistics
 from rs_localizer.ros.node.worker import Worker, wait_for_workers
@@ -221,8 +220,7 @@ def test_what_an_update_of_nobody_foresaw_is_told_and_the_next_is_done():
     assert "a bug" in told[0]
 
 
-def test_a_frame_waits_for_what_it_needs_but_not_for_long(monkeypatch, fake):
-    monkeypatch.setattr(worker_module, "_LOOK_PERIOD", PATIENCE)  # it does not look by itself
+def test_a_frame_waits_for_what_it_needs_but_not_for_long(fake):
     fake.awaited = {"one"}
     fake.send("one")
     fake.send("two", topic="others")  # those behind it wait, too
@@ -233,9 +231,7 @@ def test_a_frame_waits_for_what_it_needs_but_not_for_long(monkeypatch, fake):
         time.sleep(0.001)
     assert fake.published == []
     fake.awaited.clear()
-    fake.worker.look()
     assert fake.finish(2, 2) == ["one old", "two old"]
-    monkeypatch.undo()
     fake.awaited, fake.patience_of_frames = {"three"}, 0.05
     fake.send("three")
     assert fake.finish(1, 1) == ["one old", "two old", "three old"]
