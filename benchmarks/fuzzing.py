@@ -48,7 +48,7 @@ from rs_localizer.io.bags import BagError, BagWriter, make_message, open_bag
 from rs_localizer.io.camera_files import CalibrationError, read_calibration
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import make_cloud, read_correspondences, read_keypoints, read_map
-from rs_localizer.io.images import read_compressed_image, read_image
+from rs_localizer.io.images import read_image
 from rs_localizer.io.imu import make_reading, read_imu
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import Map, MapError
@@ -477,7 +477,7 @@ def _pictures(random: Random) -> bytes:
 
 def _read_picture(packed: bytes) -> object:
     header = plain(_reading().header)
-    return read_compressed_image(SimpleNamespace(header=header, format="jpeg", data=packed))
+    return read_image(SimpleNamespace(header=header, format="jpeg", data=packed))
 
 
 @cache

@@ -15,13 +15,26 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, ClassVar
 
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.solvers.table import SOLVERS
 
 NO_NAMES = ("",)
 """A list of names without any: ROS cannot tell the type of an empty one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One setting: its default and what users are told of it."""
+
+    default: Any
+    description: str
+    minimum: float | None
+    maximum: float | None
+    choices: tuple[str, ...]
+    read_only: bool
+    fixed: bool  # once the node is configured
 
 
 def setting(
@@ -45,10 +58,8 @@ def setting(
     """
     if isinstance(default, StrEnum):
         default, choices = default.value, tuple(item.value for item in type(default))
-    metadata: dict[str, Any] = {"description": description, "choices": choices}
-    metadata |= {"minimum": limits[0], "maximum": limits[1]}
-    metadata |= {"read_only": read_only, "fixed": fixed}
-    return field(default=default, metadata=metadata)
+    about = Setting(default, description, *limits, choices, read_only, fixed)
+    return field(default=default, metadata={"setting": about})
 
 
 # In descriptions of settings, as "Deviation of the time, in s; 0: unknown".
@@ -62,9 +73,9 @@ def check(config: Any, prefix: str = "") -> None:
     take no others.
     """
     for item in fields(config):
-        if not item.metadata:
+        if (about := item.metadata.get("setting")) is None:
             continue
-        name, value, default = prefix + item.name, getattr(config, item.name), item.default
+        name, value, default = prefix + item.name, getattr(config, item.name), about.default
         if isinstance(default, bool):
             valid = isinstance(value, bool)
         elif isinstance(default, int):
@@ -77,12 +88,11 @@ def check(config: Any, prefix: str = "") -> None:
             valid = isinstance(value, str)
         if not valid:
             raise ValueError(f"{name} must be {type_of(default)}, got {value!r}")
-        choices = item.metadata["choices"]
-        if choices and value not in choices:
-            raise ValueError(f"{name} must be one of {', '.join(choices)}; got {value!r}")
-        low, high = item.metadata["minimum"], item.metadata["maximum"]
+        if about.choices and value not in about.choices:
+            raise ValueError(f"{name} must be one of {', '.join(about.choices)}; got {value!r}")
+        low, high = about.minimum, about.maximum
         if low is not None and not (low <= value <= high):
-            unit = _UNIT.search(item.metadata["description"])
+            unit = _UNIT.search(about.description)
             unit_name = f" {unit[1]}" if unit else ""
             raise ValueError(f"{name} must lie between {low} and {high}{unit_name}, got {value!r}")
         if isinstance(default, (int, float)):
@@ -114,30 +124,38 @@ def _are_numbers(value: Any, count: int) -> bool:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class _Checked:
+    """Settings whose types, ranges and choices are checked when they are made."""
+
+    prefix: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        check(self, self.prefix)
+
+
 # Of a velocity prior; anything less would hold the camera still with infinite force.
 _LEAST_DEVIATION = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class VelocityPrior:
+class VelocityPrior(_Checked):
     """How fast cameras move: standard deviations of the zero-mean velocity prior.
 
     Robots, drones and hands; the points themselves show slower motion.
     """
 
+    prefix = "velocity_prior."
+
     angular: float = setting(
-        6.0,
-        "Standard deviation of the camera's angular velocity, in rad/s; 0: no prior",
-        (0.0, 100.0),
+        6.0, "Standard deviation of the angular velocity, in rad/s; 0: no prior", (0.0, 100.0)
     )
     linear: float = setting(
-        3.0,
-        "Standard deviation of the camera's linear velocity, in m/s; 0: no prior",
-        (0.0, 10000.0),
+        3.0, "Standard deviation of the linear velocity, in m/s; 0: no prior", (0.0, 10000.0)
     )
 
     def __post_init__(self) -> None:
-        check(self, "velocity_prior.")
+        _Checked.__post_init__(self)
         for name in ("angular", "linear"):
             deviation = getattr(self, name)
             if 0.0 < deviation < _LEAST_DEVIATION:
@@ -148,24 +166,21 @@ class VelocityPrior:
 
 
 @dataclass(frozen=True, slots=True)
-class Acceleration:
+class Acceleration(_Checked):
     """How fast cameras change their velocities, within a readout and from frame to frame."""
 
+    prefix = "acceleration."
+
     angular: float = setting(
-        10.0,
-        "Standard deviation of the camera's angular acceleration, in rad/s^2",
-        (0.001, 10000.0),
+        10.0, "Standard deviation of the angular acceleration, in rad/s^2", (0.001, 10000.0)
     )
     linear: float = setting(
-        4.0, "Standard deviation of the camera's linear acceleration, in m/s^2", (0.001, 10000.0)
+        4.0, "Standard deviation of the linear acceleration, in m/s^2", (0.001, 10000.0)
     )
-
-    def __post_init__(self) -> None:
-        check(self, "acceleration.")
 
 
 @dataclass(frozen=True, slots=True)
-class CalibrationErrors:
+class CalibrationErrors(_Checked):
     """Errors of the lens's calibration: parts that do not overlap.
 
     The defaults fit a board that was held before an ordinary camera for half a minute;
@@ -176,6 +191,8 @@ class CalibrationErrors:
     is 2 m away, all defaults together add 7 %.
     """
 
+    prefix = "calibration."
+
     principal_point: float = setting(
         1.0, "Standard deviation of the principal point, in pixels", (0.0, 1000.0)
     )
@@ -183,17 +200,12 @@ class CalibrationErrors:
         0.002, "Standard deviation of the focal length, as a share of it", (0.0, 1.0)
     )
     distortion: float = setting(
-        0.5,
-        "Standard deviation of the distortion at the corners of the image, in pixels",
-        (0.0, 1000.0),
+        0.5, "Standard deviation of the distortion at the image's corners, in pixels", (0.0, 1000.0)
     )
     # What calibrations of phones and webcams scatter by; it looks like a turn across the rows.
     aspect_ratio: float = setting(
         0.003, "Standard deviation of fy over fx, as a share of it", (0.0, 1.0)
     )
-
-    def __post_init__(self) -> None:
-        check(self, "calibration.")
 
 
 class RefinementKind(StrEnum):
@@ -205,7 +217,7 @@ class RefinementKind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class LocalizerConfig:
+class LocalizerConfig(_Checked):
     """Settings of one pose estimate (keyword arguments of :class:`rs_localizer.Localizer`)."""
 
     solver: str = setting(
@@ -216,9 +228,8 @@ class LocalizerConfig:
     )
     refinement: str = setting(
         RefinementKind.FULL,
-        "What follows the search; none: nothing, the model of the best sample is published without "
-        "a covariance; motion: least squares on the inliers, without priors; full: the posterior. "
-        "Only full tracks frames",
+        "What follows the search; none: nothing, and no covariance; motion: least squares without "
+        "priors; full: the posterior, which alone tracks frames",
     )
     inlier_threshold: float = setting(
         2.0,
@@ -226,16 +237,9 @@ class LocalizerConfig:
         "deviations of the noise, at most twice this",
         (0.01, 1000.0),
     )
-    max_iterations: int = setting(
-        1000,
-        "Most minimal samples of the motion search; the global-shutter search before it takes at "
-        "most 384",
-        (1, 1_000_000),
-    )
+    max_iterations: int = setting(1000, "Most minimal samples of the motion search", (1, 1_000_000))
     confidence: float = setting(
-        0.99,
-        "The search stops when a sample without outliers has been drawn with this probability",
-        (0.0, 0.999999),
+        0.99, "Probability of a sample without outliers that ends the search", (0.0, 0.999999)
     )
     min_inliers: int = setting(8, "Fewest inliers of an accepted pose", (7, 1_000_000))
     seed: int = setting(0, "Seed of the random samples; every frame starts from it", (0, 2**31 - 1))
@@ -243,23 +247,18 @@ class LocalizerConfig:
     acceleration: Acceleration = field(default_factory=Acceleration)
     calibration: CalibrationErrors = field(default_factory=CalibrationErrors)
     map_deviation: float = setting(
-        0.0,
-        "Standard deviation of the map's points, in m, with errors that neighbours share; it "
-        "widens covariances and gates",
-        (0.0, 1000.0),
+        0.0, "Standard deviation of the map's points, in m, shared by neighbours", (0.0, 1000.0)
     )
 
     def __post_init__(self) -> None:
-        check(self)
+        _Checked.__post_init__(self)
         for name, kind in (
             ("velocity_prior", VelocityPrior),
             ("acceleration", Acceleration),
             ("calibration", CalibrationErrors),
         ):
-            if not isinstance(getattr(self, name), kind):
-                raise ValueError(
-                    f"{name} must be of type {kind.__name__}, got {getattr(self, name)!r}"
-                )
+            if not isinstance(value := getattr(self, name), kind):
+                raise ValueError(f"{name} must be of type {kind.__name__}, got {value!r}")
 
 
 def meant(name: str, known: Sequence[str], otherwise: str = "") -> str:
@@ -309,13 +308,13 @@ class ImuUse(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Imu:
+class Imu(_Checked):
     """The IMU beside the camera, and how far it is believed."""
 
+    prefix = "imu."
+
     use: str = setting(
-        ImuUse.AUTO,
-        "auto: use the IMU if messages arrive on imu and TF has its transform to the camera; "
-        "none: never",
+        ImuUse.AUTO, "auto: if messages arrive and TF has its transform to the camera; none: never"
     )
     time_offset: float = setting(
         0.0, "Time to add to the stamps of the IMU to get the camera's time, in s", (-10.0, 10.0)
@@ -334,7 +333,7 @@ class Imu:
     )
     gyroscope_noise: float = setting(
         2e-4,
-        "Least noise density of the gyroscope, in rad/s/sqrt(Hz); more is learned",
+        "Least noise of the gyroscope, in rad/s/sqrt(Hz); more is learned",
         (1e-7, 1.0),
     )
     gyroscope_bias_walk: float = setting(
@@ -344,29 +343,22 @@ class Imu:
         False, "Use the direction of gravity that the accelerometer shows; needs gravity_in_map"
     )
     wait: float = setting(
-        0.02,
-        "Longest time that a frame waits for the messages of its exposure, in s; then it is "
-        "localized without them",
-        (0.0, 1.0),
+        0.02, "Longest wait of a frame for the messages of its exposure, in s", (0.0, 1.0)
     )
-
-    def __post_init__(self) -> None:
-        check(self, "imu.")
 
 
 @dataclass(frozen=True, slots=True)
-class RigSettings:
+class RigSettings(_Checked):
     """How the images of several cameras become frames."""
+
+    prefix = "rig."
 
     window: float = setting(
         0.02,
-        "Images of several cameras form one frame if the middles of their exposures lie within "
-        "this time, in s; cameras without a common trigger need half their period",
+        "Longest time between the middles of the exposures of one frame, in s; cameras without a "
+        "common trigger need half their period",
         (0.0, 1.0),
     )
-
-    def __post_init__(self) -> None:
-        check(self, "rig.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -391,43 +383,31 @@ class NodeConfig(LocalizerConfig):
 
     readout_time: float = setting(
         0.0,
-        "Time from the first to the last row of the full sensor image, in s; "
-        "0: unknown, then no twist is published",
+        "Time from the first to the last row of the full sensor image, in s; 0: unknown, no twist",
         (0.0, LONGEST_READOUT_TIME),
     )
     readout_time_deviation: float = setting(
-        0.0,
-        "Standard deviation of readout_time, in s, as rs_localizer calibrate finds it",
-        (0.0, LONGEST_READOUT_TIME),
+        0.0, "Standard deviation of readout_time, in s", (0.0, LONGEST_READOUT_TIME)
     )
     scan_direction: str = setting(
         ScanDirection.TOP_TO_BOTTOM, "Direction in which the shutter moves over the raw image"
     )
     stamp_offset: float = setting(
-        0.0,
-        "Time from header.stamp to the middle of the exposure of the first row, in s",
-        (-10.0, 10.0),
+        0.0, "Time from header.stamp to mid-exposure of the first row, in s", (-10.0, 10.0)
     )
     pose_time: str = setting(
         PoseTime.STAMP,
-        "stamp: the pose is valid at the input's stamp; mid_frame: the output's stamp is moved to "
-        "the exposure of the middle row",
+        "stamp: the pose is of the input's stamp; mid_frame: pose and stamp are of the middle row",
     )
     tracking: bool = setting(
-        True,
-        "Use the previous pose and twist as first guess and prior; needs a rolling-shutter solver "
-        "and a readout_time, without which only errors of map and lens are tracked",
+        True, "The frames before predict pose and twist; needs a readout_time and a solver for it"
     )
     output_lag: int = setting(
-        0,
-        "Frames by which a tracked result is delayed, so that later frames improve its twist; for "
-        "maps, logs and filters with delayed states",
-        (0, 5),
+        0, "Frames for which a tracked result waits, which improve its twist", (0, 5)
     )
     output_rate: float = setting(
         0.0,
-        "Rate of pose, twist and odometry, in Hz, predicted to the current time from the motion of "
-        "the last tracked frames; 0: one output per image",
+        "Rate of pose, twist and odometry, in Hz, predicted to now; 0: one output per image",
         (0.0, 1000.0),
     )
     max_prediction: float = setting(
@@ -435,14 +415,12 @@ class NodeConfig(LocalizerConfig):
     )
     max_points: int = setting(
         20_000,
-        "Most points of a frame that are used: those with the best scores; without scores, evenly "
-        "chosen over the image",
+        "Most points of a frame that are used: the best by score, or evenly over the image",
         (7, 1_000_000),
     )
     base_frame: str = setting(
         "",
-        "Frame of the body whose pose and twist are published, connected to the camera by TF; "
-        "empty: the camera's optical frame",
+        "Frame whose pose and twist are published; empty: the camera's own",
         fixed=True,
     )
     odom_frame: str = setting(
@@ -454,23 +432,17 @@ class NodeConfig(LocalizerConfig):
         "map_to_odom: REP-105, needs odometry on TF",
     )
     tf_rate: float = setting(
-        20.0,
-        "Rate of map_to_odom on TF, in Hz; the last correction is held between frames and without "
-        "them; 0: once per frame",
-        (0.0, 1000.0),
+        20.0, "Rate of map_to_odom on TF, in Hz; 0: once per frame", (0.0, 1000.0)
     )
     hold: float = setting(
-        0.0,
-        "Longest time that the last correction is held without a pose, in s; 0: for ever",
-        (0.0, 1e6),
+        0.0, "Longest time that map_to_odom is held without a pose, in s; 0: for ever", (0.0, 1e6)
     )
     two_d_mode: bool = setting(
         False, "Set z, roll and pitch of map_to_odom to zero, for robots on a floor"
     )
     transform_tolerance: float = setting(
         0.2,
-        "Longest wait for a transform that is not there yet, and time by which map_to_odom is "
-        "stamped into the future, in s",
+        "Longest wait for a transform, and time by which map_to_odom is stamped ahead, in s",
         (0.0, 10.0),
     )
     camera_file: str = setting(
@@ -481,16 +453,11 @@ class NodeConfig(LocalizerConfig):
     )
     map_file: str = setting(
         "",
-        "Map that keypoints are matched with: a .npz file or a sparse model of COLMAP; "
-        "empty: none, or the one published on map_points",
+        "Map for keypoints: a .npz file or a sparse model of COLMAP; empty: map_points",
         fixed=True,
     )
     map_frame: str = setting("map", "Frame of the points in map_file", fixed=True)
-    marker_map: str = setting(
-        "",
-        "Marker map for the topic detections, in the marker detector's format; empty: none",
-        fixed=True,
-    )
+    marker_map: str = setting("", "Marker map for the topic detections; empty: none", fixed=True)
     imu: Imu = field(default_factory=Imu)
     cameras: tuple[str, ...] = setting(
         NO_NAMES,
@@ -570,12 +537,9 @@ class ImageTransport(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class DetectorConfig:
-    """Settings of the marker detector."""
+class _ImageConfig(_Checked):
+    """Settings of both detectors."""
 
-    marker_map: str = setting(
-        "", "File of the marker map; rs_localizer markers make writes one with the prints"
-    )
     transport: str = setting(
         ImageTransport.AUTO,
         "Topic of the images; auto: image if it has a publisher, otherwise image/compressed",
@@ -583,8 +547,14 @@ class DetectorConfig:
     )
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
 
-    def __post_init__(self) -> None:
-        check(self)
+
+@dataclass(frozen=True, slots=True)
+class DetectorConfig(_ImageConfig):
+    """Settings of the marker detector."""
+
+    marker_map: str = setting(
+        "", "File of the marker map; rs_localizer markers make writes one with the prints"
+    )
 
 
 class FeatureKind(StrEnum):
@@ -596,22 +566,12 @@ class FeatureKind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class FeatureConfig:
+class FeatureConfig(_ImageConfig):
     """Settings of the feature detector."""
 
     features: str = setting(
-        FeatureKind.SIFT,
-        "How keypoints are found and described; sift: as COLMAP does; it has to be the map's",
+        FeatureKind.SIFT, "How keypoints are found and described; it has to be the map's"
     )
     max_keypoints: int = setting(
         1000, "Most keypoints of an image: the best ones of all its parts", (7, 1_000_000)
     )
-    transport: str = setting(
-        ImageTransport.AUTO,
-        "Topic of the images; auto: image if it has a publisher, otherwise image/compressed",
-        read_only=True,
-    )
-    autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
-
-    def __post_init__(self) -> None:
-        check(self)

@@ -11,8 +11,9 @@ import contextlib
 import json
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass, replace
 from enum import Enum
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
@@ -22,6 +23,7 @@ from rs_localizer.config import (
     DetectorConfig,
     FeatureConfig,
     NodeConfig,
+    Setting,
     meant,
 )
 from rs_localizer.io.reading import (
@@ -52,24 +54,10 @@ FIRST = (
 """The settings that everybody sets, first in the help, as in README."""
 Kind = type[NodeConfig] | type[DetectorConfig] | type[FeatureConfig]
 Config = TypeVar("Config", NodeConfig, DetectorConfig, FeatureConfig)
-_cached: dict[Kind, dict[str, Setting]] = {}
 
 
 class SettingsError(ValueError):
     """A params file or an assignment that cannot be used; the text says what was found."""
-
-
-@dataclass(frozen=True, slots=True)
-class Setting:
-    """One setting: its default and what users are told of it."""
-
-    default: Any
-    description: str
-    minimum: float | None
-    maximum: float | None
-    choices: tuple[str, ...]
-    read_only: bool
-    fixed: bool  # once the node is configured
 
 
 # What each camera of a rig has of its own, below its name.
@@ -89,17 +77,15 @@ def camera_settings(values: Mapping[str, Any]) -> dict[str, Setting]:
 def _cameras(values: Mapping[str, Any]) -> list[str]:
     """Return the names of cameras; none if they are no names, which is refused elsewhere."""
     given = as_tuple(values.get("cameras", NO_NAMES))
-    return (
-        [name for name in given if isinstance(name, str) and name] if type(given) is tuple else []
-    )
+    names = given if isinstance(given, tuple) else ()
+    return [name for name in names if isinstance(name, str) and name]
 
 
+@cache
 def settings(kind: Kind = NodeConfig) -> dict[str, Setting]:
     """Return all settings of a node, by dotted name."""
-    if kind not in _cached:
-        found = dict(_walk(kind(), ""))
-        _cached[kind] = {name: found[name] for name in (*FIRST, *found) if name in found}
-    return _cached[kind]
+    found = dict(_walk(kind(), ""))
+    return {name: found[name] for name in (*FIRST, *found) if name in found}
 
 
 def _walk(config: Any, prefix: str) -> Iterator[tuple[str, Setting]]:
@@ -108,7 +94,7 @@ def _walk(config: Any, prefix: str) -> Iterator[tuple[str, Setting]]:
         if is_dataclass(value):
             yield from _walk(value, f"{prefix}{item.name}.")
         elif item.metadata:
-            yield prefix + item.name, Setting(default=value, **item.metadata)
+            yield prefix + item.name, item.metadata["setting"]
 
 
 def unknown(name: str, kind: Kind = NodeConfig) -> str | None:
@@ -242,29 +228,24 @@ def _checked(name: str, value: Any, where: str, kind: Kind) -> Any:
     return value
 
 
-def write_parameters(path: Path, values: Mapping[str, Any]) -> None:
-    """Write values by dotted name as a params file, for ``replay --params`` and nodes."""
-    _write(path, f"/**/{NODE_NAME}", values)  # in any namespace
-
-
-def write_camera_file(
-    path: Path, values: Mapping[str, Any], lens: Mapping[str, Any], remarks: Sequence[str] = ()
+def write_parameters(
+    path: Path,
+    values: Mapping[str, Any],
+    lens: Mapping[str, Any] | None = None,
+    remarks: Sequence[str] = (),
 ) -> None:
-    """Write the calibration of a camera or a rig, for ``--camera`` and ``camera_file``.
+    """Write values by dotted name as a params file, for ``replay --params`` and nodes.
 
     Args:
-        values: the settings, by dotted name.
-        lens: as ``io.camera_files.lens_parameters`` or ``io.rigs.mounted_lenses`` have it.
+        lens: of the file of a camera or a rig, for ``--camera`` and ``camera_file``; as
+            ``io.camera_files.lens_parameters`` or ``io.rigs.mounted_lenses`` have it.
         remarks: lines of comment.
     """
-    known = {**values, LENS: lens} if lens else values
-    _write(path, "/**", known, remarks)  # a node may have any name
-
-
-def _write(path: Path, nodes: str, values: Mapping[str, Any], remarks: Sequence[str] = ()) -> None:
     build(values)  # refuses wrong ones
+    # In any namespace; for a node of any name if it is a camera's.
+    nodes = f"/**/{NODE_NAME}" if lens is None else "/**"
     lines = [*(f"# {text}" for text in remarks), f"{nodes}:", "  ros__parameters:"]
-    lines += _lines(values, "    ")
+    lines += _lines({**values, **({LENS: lens} if lens else {})}, "    ")
     path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
 
 

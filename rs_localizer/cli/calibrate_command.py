@@ -44,7 +44,7 @@ if WORKING:
     from rs_localizer.offline.recordings import optical_frame, read_imu_recording
     from rs_localizer.offline.replay import has_frames
     from rs_localizer.pipeline.marker_detector import FrameDetector
-    from rs_localizer.settings import write_camera_file
+    from rs_localizer.settings import write_parameters
     from rs_localizer.tools import verdict
     from rs_localizer.tools.adjust.intrinsics import LensErrors
     from rs_localizer.tools.adjust.observe import ImagePoints, in_order
@@ -274,7 +274,7 @@ def _write(
     remarks = [f"readout_time {refused}"] if refused else []
     camera = found.fit.camera
     lens = lens_parameters(camera)
-    write = partial(write_camera_file, values=values, lens=lens, remarks=remarks)
+    write = partial(write_parameters, values=values, lens=lens, remarks=remarks)
     write_all({**writers, **_lens_writers(args, {"": camera}), out: write})
     if refused:
         refused += (
@@ -339,7 +339,7 @@ def _mount(
     write_all({
         place: partial(rigs.write_static_transforms, parts=parts, frames=frames),
         **_lens_writers(args, parts.cameras),
-        args.out: partial(write_camera_file, values=values, lens=lens, remarks=comments),
+        args.out: partial(write_parameters, values=values, lens=lens, remarks=comments),
     })  # fmt: skip
     when = "next" if shutil.which("ros2") else "next, in a ROS 2 workspace"
     print(f"{when}: {shlex.join(['ros2', 'launch', str(place)])}")

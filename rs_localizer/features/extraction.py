@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rs_localizer.config import FeatureKind
 from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.io.clouds import choose_balanced
 from rs_localizer.io.maps.landmarks import Map
 
 _ORB_BYTES = 32  # of a descriptor; AKAZE's has 61
@@ -163,30 +164,6 @@ _METHODS: dict[str, _Method] = {
     FeatureKind.ORB: _Method(_orb, False, _orb_place),
     FeatureKind.AKAZE: _Method(_akaze, True, lambda _, found: _points(found)),
 }
-
-
-# Keypoints that a cell of the grid holds on average.
-_PER_CELL = 8
-
-
-def choose_balanced(pixels: Array, scores: Array, size: tuple[int, int], most: int) -> IntArray:
-    """Return rows (k,) of the best keypoints of each cell of a grid, then of the second best ...
-
-    Args:
-        pixels: (n,2)
-        scores: (n,) higher is better.
-        size: width and height of the image.
-        most: how many to keep.
-    """
-    count = len(pixels)
-    if count <= most:
-        return np.arange(count)
-    side = np.sqrt(size[0] * size[1] * _PER_CELL / most)
-    columns, rows = (pixels // side).astype(np.int64).T
-    cells = rows * (int(size[0] // side) + 1) + columns
-    order = np.lexsort((-scores, cells))
-    ranks = np.arange(count) - np.searchsorted(cells[order], cells[order])
-    return np.sort(order[np.lexsort((-scores[order], ranks))[:most]])
 
 
 def kind_of(landmarks: Map) -> str:

@@ -122,8 +122,7 @@ class BagReader:
         Raises:
             BagError: for a topic that is not in the recording, or damaged data.
         """
-        missing = [topic for topic in topics if topic not in self.topics]
-        if missing:
+        if missing := [topic for topic in topics if topic not in self.topics]:
             raise BagError(
                 f"{self.path} has no topic {', '.join(missing)}; it has "
                 f"{', '.join(sorted(self.topics))}"
@@ -137,7 +136,7 @@ class BagReader:
             for connection, stamp_ns, data in self._reader.messages(connections=wanted):
                 kind = normalize_msgtype(connection.msgtype)
                 message = self._reader.deserialize(data, kind)
-                if not self._reader.is2:
+                if kind == "sensor_msgs/msg/CameraInfo" and not self._reader.is2:
                     message = _as_ros2(message, kind)
                 yield connection.topic, stamp_ns, message
 
@@ -225,10 +224,7 @@ def _explained(path: Path) -> Iterator[None]:
 
 
 def _as_ros2(message: Any, type_name: str) -> Any:
-    """Convert a message of ROS 1 to the field names of ROS 2 (``header.seq`` stays as an extra)."""
-    if type_name != "sensor_msgs/msg/CameraInfo":
-        return message
-    # ROS 2 spells D, K, R and P in lower case.
+    """Convert a camera_info of ROS 1, where D, K, R and P are in upper case."""
     fields = {name.lower(): getattr(message, name) for name in message.__dataclass_fields__}
     fields.pop("__msgtype__", None)
     return make_message(type_name, **fields)
@@ -269,21 +265,15 @@ class BagWriter:
 
     def write(self, topic: str, message: Any, stamp_ns: int) -> None:
         """Append a message of :func:`make_message`; ``stamp_ns`` is its time of recording."""
-        data = typestore().serialize_cdr(message, message.__msgtype__)
+        kind = message.__msgtype__
+        data = typestore().serialize_cdr(message, kind)
         with self._explained():
-            self._writer.write(self._connection(topic, message.__msgtype__), stamp_ns, data)
-
-    def _connection(self, topic: str, type_name: str) -> Any:
-        connection = self._connections.get(topic)
-        if connection is None:
-            connection = self._writer.add_connection(
-                topic,
-                type_name,
-                typestore=typestore(),
-                offered_qos_profiles=[_LATCHED] if topic == TF_STATIC else [],
-            )
-            self._connections[topic] = connection
-        return connection
+            if topic not in self._connections:
+                self._connections[topic] = self._writer.add_connection(
+                    topic, kind, typestore=typestore(),
+                    offered_qos_profiles=[_LATCHED] if topic == TF_STATIC else [],
+                )  # fmt: skip
+            self._writer.write(self._connections[topic], stamp_ns, data)
 
     @contextlib.contextmanager
     def _explained(self) -> Iterator[None]:

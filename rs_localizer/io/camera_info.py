@@ -37,16 +37,9 @@ class Calibration:
             raise MessageError("the camera is not calibrated: K[0] is 0")
         try:
             return Camera(
-                width=self.width,
-                height=self.height,
-                K=np.reshape(self.K, (3, 3)),
-                D=np.array(self.D),
-                distortion_model=self.distortion_model,
-                readout_time=readout_time,
-                scan_direction=scan_direction,
-                binning=self.binning,
-                roi=self.roi,
-            )
+                self.width, self.height, np.reshape(self.K, (3, 3)), np.array(self.D),
+                self.distortion_model, readout_time, scan_direction, self.binning, self.roi,
+            )  # fmt: skip
         except ValueError as error:
             raise MessageError(str(error)) from error
 
@@ -159,11 +152,8 @@ def _roi(roi: Any, width: int, height: int) -> Roi | None:
     region = Roi(int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height))
     if region == Roi(0, 0, 0, 0):
         return None
-    if (
-        min(region.width, region.height) < 1
-        or region.x_offset + region.width > width
-        or region.y_offset + region.height > height
-    ):
+    ends = region.x_offset + region.width, region.y_offset + region.height
+    if min(region.width, region.height) < 1 or ends[0] > width or ends[1] > height:
         raise MessageError(
             f"the region of interest, {region.width} x {region.height} at ({region.x_offset}, "
             f"{region.y_offset}), does not lie in the image of {width} x {height}: width and "

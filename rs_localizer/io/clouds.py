@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.io.maps.landmarks import Descriptors, Ids, Map, MapError, make_map
 from rs_localizer.io.messages import Make, MessageError, frame_id, make_header, stamp_ns
 
@@ -33,8 +33,8 @@ _TYPES = dict.fromkeys(("x", "y", "z", "u", "v", "score"), (7, 8)) | {
 _ARRAYS = ("descriptor",)  # several values per point
 # NumPy has no larger rows.
 _LONGEST_ROW = 2**31 - 1
-# Parts of an image, across and down, of which each keeps as many points as the others.
-_PARTS = (16, 12)
+# Points that a cell of the grid holds on average, over which they are spread.
+_PER_CELL = 8
 
 Field = tuple[str, int, int, int]  # name, offset, datatype, count
 
@@ -89,16 +89,9 @@ def thin_cloud(cloud: Correspondences, most: int, size: tuple[int, int]) -> Corr
     if len(cloud.points) <= most:
         return cloud
     if cloud.scores is not None:
-        rank = -cloud.scores
+        chosen = np.sort(np.argsort(-cloud.scores, kind="stable")[:most])
     else:
-        share = np.clip(cloud.pixels / size, 0.0, 1.0 - 1e-9)
-        column, row = (share * _PARTS).astype(np.int64).T
-        part = row * _PARTS[0] + column
-        order = np.argsort(part, kind="stable")
-        sorted_ = part[order]
-        rank = np.empty(len(part))
-        rank[order] = np.arange(len(part)) - np.searchsorted(sorted_, sorted_)
-    chosen = np.sort(np.argsort(rank, kind="stable")[:most])
+        chosen = choose_balanced(cloud.pixels, np.zeros(len(cloud.points)), size, most)
     return replace(
         cloud,
         points=cloud.points[chosen],
@@ -106,6 +99,26 @@ def thin_cloud(cloud: Correspondences, most: int, size: tuple[int, int]) -> Corr
         scores=None if cloud.scores is None else cloud.scores[chosen],
         table=cloud.table[chosen],
     )
+
+
+def choose_balanced(pixels: Array, scores: Array, size: tuple[int, int], most: int) -> IntArray:
+    """Return rows (k,) of the best pixels of each cell of a grid, then of the second best ...
+
+    Args:
+        pixels: (n,2)
+        scores: (n,) higher is better.
+        size: width and height of the image.
+        most: how many to keep.
+    """
+    count = len(pixels)
+    if count <= most:
+        return np.arange(count)
+    side = np.sqrt(size[0] * size[1] * _PER_CELL / most)
+    columns, rows = (np.clip(pixels, 0.0, size) // side).astype(np.int64).T
+    cells = rows * (int(size[0] // side) + 1) + columns
+    order = np.lexsort((-scores, cells))
+    ranks = np.arange(count) - np.searchsorted(cells[order], cells[order])
+    return np.sort(order[np.lexsort((-scores[order], ranks))[:most]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

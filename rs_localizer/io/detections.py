@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.messages import MessageError, stamp_ns
@@ -49,8 +48,7 @@ class TagDetections:
     """The tags of an image."""
 
     stamp_ns: int
-    families: tuple[str, ...]  # (m) as the detector calls them
-    ids: NDArray[np.int64]  # (m,)
+    names: list[tuple[str, int]]  # (m) family, as apriltag calls it, and id
     corners: Array  # (m,4,2) px, centre of the first one at 0, 0; clockwise from the upper left
 
 
@@ -71,17 +69,11 @@ def read_detections(message: Any) -> TagDetections:
         row[:] = [[point.x, point.y] for point in points]
     if not np.isfinite(corners).all():
         raise MessageError("corners of a detection are not finite")
-    return TagDetections(
-        stamp_ns(message),
-        tuple(_family(str(_field(one, "family", "a detection"))) for one in items),
-        np.array([int(_field(one, "id", "a detection")) for one in items], np.int64),
-        corners[:, ::-1] - _FIRST_PIXEL,
-    )
-
-
-def _family(name: str) -> str:
-    """Name of a family as apriltag has it: ``tag36h11``."""
-    return re.sub(r"^(?:tag_?)?(?=\d\dh\d)", "tag", name)
+    names = []
+    for detection in items:
+        family, number = (_field(detection, name, "a detection") for name in ("family", "id"))
+        names.append((re.sub(r"^(?:tag_?)?(?=\d\dh\d)", "tag", str(family)), int(number)))
+    return TagDetections(stamp_ns(message), names, corners[:, ::-1] - _FIRST_PIXEL)
 
 
 def _field(item: Any, name: str, what: str) -> Any:

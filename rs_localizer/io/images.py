@@ -93,21 +93,21 @@ def most_pixels(packed: int) -> int:
     return min(_ALIKE + _DENSEST * packed, _MOST_PIXELS)
 
 
-def read_any_image(message: Any) -> Image:
-    """Read a sensor_msgs/Image or CompressedImage.
+def read_image(message: Any) -> Image:
+    """Read a sensor_msgs/Image, or a CompressedImage: JPEG or PNG.
 
     Raises:
         MessageError: when it cannot be read, saying what was found.
     """
-    return read_compressed_image(message) if hasattr(message, "format") else read_image(message)
+    if hasattr(message, "format"):
+        pixels = decode_image(bytes(message.data), str(message.format))
+    else:
+        pixels = _raw_pixels(message)
+    return Image(stamp_ns(message), str(message.header.frame_id), pixels)
 
 
-def read_image(message: Any) -> Image:
-    """Read a sensor_msgs/Image.
-
-    Raises:
-        MessageError: for an encoding that is not supported, or data that do not fit the size.
-    """
+def _raw_pixels(message: Any) -> Gray:
+    """Return the gray pixels of a sensor_msgs/Image."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     name = str(message.encoding)
     encoding = _ENCODINGS.get(name)
@@ -118,9 +118,9 @@ def read_image(message: Any) -> Image:
     if width == 0 or height == 0:
         raise MessageError(f"the image has no pixels: width {width}, height {height}")
     kind = np.dtype((">" if message.is_bigendian else "<") + encoding.kind)
-    row = width * encoding.channels * kind.itemsize
-    if step == 0:  # some drivers leave it out
-        step = row
+    pixel = encoding.channels * kind.itemsize
+    row = width * pixel
+    step = step or row  # some drivers leave it out
     if step < row:
         raise MessageError(f"step is {step}, too small for {width} pixels of {name}: {row} bytes")
     expected = (height - 1) * step + row
@@ -131,21 +131,13 @@ def read_image(message: Any) -> Image:
             f"the data are truncated: {width} x {height} pixels of {name} take {expected} bytes, "
             f"found {len(message.data)}"
         )
-    pixel = encoding.channels * kind.itemsize
-    raw: NDArray[Any] = np.ndarray(
-        (height, width, encoding.channels), kind, message.data, strides=(step, pixel, kind.itemsize)
-    )
-    return Image(stamp_ns(message), str(message.header.frame_id), _gray(raw, encoding))
-
-
-def read_compressed_image(message: Any) -> Image:
-    """Read a sensor_msgs/CompressedImage: JPEG or PNG.
-
-    Raises:
-        MessageError: for anything else, or an image that is truncated or damaged.
-    """
-    pixels = decode_image(bytes(message.data), str(message.format))
-    return Image(stamp_ns(message), str(message.header.frame_id), pixels)
+    shape = height, width, encoding.channels
+    raw: NDArray[Any] = np.ndarray(shape, kind, message.data, strides=(step, pixel, kind.itemsize))
+    if encoding.luma is not None:
+        return _eight_bits(raw[:, :, encoding.luma])
+    single = raw[:, :, 0] if encoding.channels == 1 else raw
+    native = np.ascontiguousarray(single, single.dtype.newbyteorder("="))
+    return _eight_bits(np.asarray(cv2.cvtColor(native, encoding.to_gray)))
 
 
 def decode_image(packed: bytes, format_: str) -> Gray:
@@ -224,14 +216,6 @@ def _ends_with(data: Gray, mark: bytes) -> bool:
     last = np.flatnonzero(data)
     end = int(last[-1]) + 1 if len(last) else 0
     return data[max(0, end - len(mark)) : end].tobytes() == mark
-
-
-def _gray(raw: NDArray[Any], encoding: _Encoding) -> Gray:
-    if encoding.luma is not None:
-        return _eight_bits(raw[:, :, encoding.luma])
-    single = raw[:, :, 0] if encoding.channels == 1 else raw
-    native = np.ascontiguousarray(single, single.dtype.newbyteorder("="))
-    return _eight_bits(np.asarray(cv2.cvtColor(native, encoding.to_gray)))
 
 
 def _eight_bits(image: NDArray[Any]) -> Gray:

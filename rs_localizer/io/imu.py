@@ -62,14 +62,11 @@ def read_imu(message: Any) -> ImuReading:
             "the accelerometer alone?)"
         )
     turn = _checked(_values(message.angular_velocity), "angular_velocity", "rad/s", _FASTEST)
-    force = None
-    acceleration = _values(message.linear_acceleration)
+    acceleration, force = _values(message.linear_acceleration), None
     # Drivers of gyroscopes alone may send NaN or zeros for the rest.
     if float(forces[0]) != _ABSENT and all(map(math.isfinite, acceleration)) and any(acceleration):
         force = _checked(acceleration, "linear_acceleration", "m/s^2", _HARDEST)
-    return ImuReading(
-        stamp_ns=stamp_ns(message), frame=frame, angular_velocity=turn, linear_acceleration=force
-    )
+    return ImuReading(stamp_ns(message), frame, turn, force)
 
 
 def _values(vector: Any) -> Vector:

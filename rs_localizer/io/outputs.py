@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Published parts of a localized frame, and their messages."""
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -103,64 +103,39 @@ def make_pose_with_covariance(pose: BodyPose, make: Make, made: Any = None) -> A
     return make(kind, pose=made or make_pose(pose, make), covariance=covariance)
 
 
-def messages(frame: Localized, make: Make) -> dict[str, Any]:
+def messages(frame: Localized, make: Make, wanted: Collection[str] = TYPES) -> dict[str, Any]:
     """Return the messages of a frame by topic (:data:`TYPES`), for node and replay alike.
 
     Without a readout time there is neither twist nor odometry: zeros would be a claim. Where the
     twist is unknown, those with covariance say so.
+
+    Args:
+        wanted: topics; of others nothing is built.
     """
-    return dict(each_message(frame, make, TYPES))
+    made: dict[str, Any] = {}
+    header = cache(partial(make_header, make, frame.stamp_ns))
 
-
-def each_message(
-    frame: Localized, make: Make, wanted: Collection[str]
-) -> Iterator[tuple[str, Any]]:
-    """Yield the messages of these topics; each is built when it is asked for."""
-    twist, known = frame.twist, frame.known_twist is not None
-    if twist is not None and not known:
-        twist = _UNKNOWN
-
-    @cache
-    def header(name: str) -> Any:
-        return make_header(make, frame.stamp_ns, name)
-
-    @cache
-    def pose() -> Any:
-        return make_pose(frame.pose, make)
-
-    @cache
-    def pose_with_covariance() -> Any:
-        return make_pose_with_covariance(frame.pose, make, pose())
-
-    @cache
-    def velocity() -> Any:
-        assert twist is not None
-        linear, angular = make_vector(make, twist.linear), make_vector(make, twist.angular)
-        return make("geometry_msgs/msg/Twist", linear=linear, angular=angular)
-
-    @cache
-    def velocity_with_covariance() -> Any:
-        assert twist is not None
-        kind = "geometry_msgs/msg/TwistWithCovariance"
-        return make(kind, twist=velocity(), covariance=_sent(twist.covariance))
-
-    parts: dict[str, dict[str, Callable[[], Any]]] = {
-        topics.POSE: {"pose": pose},
-        topics.POSE_WITH_COVARIANCE: {"pose": pose_with_covariance},
-    }
-    if twist is not None:
-        parts |= {
-            **({topics.TWIST: {"twist": velocity}} if known else {}),
-            topics.TWIST_WITH_COVARIANCE: {"twist": velocity_with_covariance},
-            topics.ODOMETRY: {"pose": pose_with_covariance, "twist": velocity_with_covariance},
-        }
-    for name, builders in parts.items():
+    def add(name: str, axes: str, **fields: Any) -> None:
         if name in wanted:
-            fields = {key: build() for key, build in builders.items()}
-            if name == topics.ODOMETRY:
-                fields["child_frame_id"] = frame.body_frame
-            axes = frame.map_frame if "pose" in builders else frame.body_frame
-            yield name, make(TYPES[name], header=header(axes), **fields)
+            made[name] = make(TYPES[name], header=header(axes), **fields)
+
+    if set(wanted) - {topics.INLIERS}:
+        pose = make_pose(frame.pose, make)
+        sure = make_pose_with_covariance(frame.pose, make, pose)
+        add(topics.POSE, frame.map_frame, pose=pose)
+        add(topics.POSE_WITH_COVARIANCE, frame.map_frame, pose=sure)
+        if frame.twist is not None:
+            twist = frame.known_twist or _UNKNOWN
+            linear, angular = make_vector(make, twist.linear), make_vector(make, twist.angular)
+            velocity = make("geometry_msgs/msg/Twist", linear=linear, angular=angular)
+            kind, covariance = "geometry_msgs/msg/TwistWithCovariance", _sent(twist.covariance)
+            motion = make(kind, twist=velocity, covariance=covariance)
+            if frame.known_twist:
+                add(topics.TWIST, frame.body_frame, twist=velocity)
+            add(topics.TWIST_WITH_COVARIANCE, frame.body_frame, twist=motion)
+            body = frame.body_frame
+            add(topics.ODOMETRY, frame.map_frame, child_frame_id=body, pose=sure, twist=motion)
     if topics.INLIERS in wanted:
         cloud = make_cloud(make, frame.input_stamp_ns, frame.map_frame, frame.inliers)
-        yield topics.INLIERS, cloud
+        made[topics.INLIERS] = cloud
+    return made

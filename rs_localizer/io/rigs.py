@@ -68,11 +68,12 @@ def read_camchain(path: Path | str) -> RigParts:
 
 def mounted_lenses(parts: RigParts) -> dict[str, Any]:
     """Return ``lens`` of the params file of a rig; :func:`node_parameters` are its settings."""
-    return {
-        name: lens_parameters(camera)
-        | {_MOUNT: _matrix(*parts.camera_from_rig[name]).ravel().tolist()}
-        for name, camera in parts.cameras.items()
-    }
+    lenses = {}
+    for name, camera in parts.cameras.items():
+        mount = np.eye(4)
+        mount[:3, :3], mount[:3, 3] = parts.camera_from_rig[name]
+        lenses[name] = lens_parameters(camera) | {_MOUNT: mount.ravel().tolist()}
+    return lenses
 
 
 def _read_own_rig(tree: Any) -> RigParts:
@@ -96,7 +97,8 @@ def _camchain(tree: Any) -> RigParts:
     pose = np.eye(4)
     for place, (name, item) in enumerate(tree.items()):
         try:
-            cameras[str(name)] = _camera(item)
+            shutter = {of: item[of] for of in _SHUTTER if of in item}
+            cameras[str(name)] = replace(kalibr_camera(item), **shutter)
             if by_imu:
                 pose = _rigid(_IMU, item[_IMU])
             elif place > 0:
@@ -109,19 +111,6 @@ def _camchain(tree: Any) -> RigParts:
         except (TypeError, ValueError) as error:
             raise ValueError(f"{name}: {error}") from error
     return RigParts(cameras, poses, offsets)
-
-
-def _camera(item: Any) -> Camera:
-    if not isinstance(item, dict):
-        raise ValueError(f"expected a mapping, found {item!r}")
-    shutter = {name: item[name] for name in _SHUTTER if name in item}
-    return replace(kalibr_camera(item), **shutter)
-
-
-def _matrix(rotation: Array, translation: Array) -> Array:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, translation
-    return matrix
 
 
 def _rigid(name: str, values: Any) -> Array:
@@ -139,8 +128,8 @@ def node_parameters(parts: RigParts) -> dict[str, Any]:
     """Return the node's parameters for a rig, without the extrinsics, which come from TF."""
     own: dict[str, Any] = {}
     for name, camera in parts.cameras.items():
-        values = (camera.readout_time, str(camera.scan_direction))
-        own |= {f"{name}.{of}": value for of, value in zip(_SHUTTER, values, strict=True)}
+        own[f"{name}.readout_time"] = camera.readout_time
+        own[f"{name}.scan_direction"] = str(camera.scan_direction)
         if (offset := parts.time_offset.get(name, 0.0)) != 0.0:
             own[f"{name}.stamp_offset"] = offset
     return {"cameras": list(parts.cameras), **own}

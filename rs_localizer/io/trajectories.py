@@ -15,11 +15,12 @@ import io
 import zlib
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, Literal, TextIO
+from typing import Any, Literal, Self, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,35 +40,33 @@ class TrajectoryError(ValueError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Trajectory:
-    """Poses map_from_body in the order of time."""
+class _Series:
+    """Rows in the order of time."""
 
     stamps_ns: NDArray[np.int64]  # (n,) strictly increasing
-    positions: Array  # (n,3) m
-    quaternions: Array  # (n,4) x y z w, unit
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
-    def part(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Trajectory:
-        """Return the poses of some rows."""
-        return Trajectory(self.stamps_ns[rows], self.positions[rows], self.quaternions[rows])
+    def part(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Self:
+        """Return some of the rows."""
+        return type(self)(*(getattr(self, each.name)[rows] for each in fields(self)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Twists:
+class Trajectory(_Series):
+    """Poses map_from_body in the order of time."""
+
+    positions: Array  # (n,3) m
+    quaternions: Array  # (n,4) x y z w, unit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Twists(_Series):
     """Velocities of a body in its own axes, in the order of time."""
 
-    stamps_ns: NDArray[np.int64]  # (n,) strictly increasing
     angular: Array  # (n,3) rad/s
     linear: Array  # (n,3) m/s
-
-    def __len__(self) -> int:
-        return len(self.stamps_ns)
-
-    def part(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Twists:
-        """Return the twists of some rows."""
-        return Twists(self.stamps_ns[rows], self.angular[rows], self.linear[rows])
 
 
 def read_tum(path: Path | str) -> Trajectory:
@@ -147,7 +146,7 @@ def _open(path: Path, mode: Literal["r", "w"]) -> TextIO:
 
 def _read_table(path: Path, columns: tuple[str, ...]) -> tuple[NDArray[np.int64], Array]:
     """Return times (ns) and the other columns, without comments, headings and empty lines."""
-    stamps, numbers, table = array("q"), array("q"), array("d")  # lists take ten times the memory
+    stamps, table = array("q"), array("d")  # lists take ten times the memory
     for number, line in _lines(path):
         words = line.replace(",", " ").split()
         try:
@@ -164,19 +163,15 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> tuple[NDArray[np.int64]
                 f"{line[:80]!r}"
             ) from None
         stamps.append(stamp_ns)
-        numbers.append(number)
         table.extend(values)
     if not stamps:
         raise TrajectoryError(f"{path} holds no line of numbers")
     order = np.argsort(np.array(stamps), kind="stable")
     times, rows = np.array(stamps)[order], np.reshape(table, (-1, len(columns)))[order]
     again = times[1:] == times[:-1]
-    if len(others := np.flatnonzero(again & np.any(rows[1:] != rows[:-1], axis=1))):
-        other = others[np.argmin(np.array(numbers)[order][1:][others])]
-        raise TrajectoryError(
-            f"{path}, line {numbers[order[other + 1]]}: the time "
-            f"{format_stamp(times[other]).rstrip('0')} was there before, with other values"
-        )
+    if np.any(unlike := again & np.any(rows[1:] != rows[:-1], axis=1)):
+        time = format_stamp(times[1:][unlike][0]).rstrip("0")
+        raise TrajectoryError(f"{path}: the time {time} is there twice, with different values")
     first = np.append(True, ~again)
     return times[first], rows[first]
 
@@ -239,34 +234,25 @@ def read_motions(
         pose_topic = bag.find_topic((_POSE,), pose_topic, "-r pose:=TOPIC")
         if twist_topic is not None or _TWIST in bag.topics.values():
             twist_topic = bag.find_topic((_TWIST,), twist_topic, "-r twist:=TOPIC")
-        messages = _by_stamp(bag, pose_topic)
-        poses = Trajectory(
-            np.array(list(messages), np.int64),
-            np.array([_xyz(m.pose.position) for m in messages.values()]),
-            np.array([_xyzw(m.pose.orientation) for m in messages.values()]),
-        )
+        poses = Trajectory(*_recorded(bag, pose_topic, "pose.position", "pose.orientation"))
         if twist_topic is None:
             return Motions(poses, None)
-        messages = _by_stamp(bag, twist_topic)
-        return Motions(
-            poses,
-            Twists(
-                np.array(list(messages), np.int64),
-                np.array([_xyz(m.twist.angular) for m in messages.values()]),
-                np.array([_xyz(m.twist.linear) for m in messages.values()]),
-            ),
-        )
+        return Motions(poses, Twists(*_recorded(bag, twist_topic, "twist.angular", "twist.linear")))
 
 
-def _by_stamp(bag: BagReader, topic: str) -> dict[int, Any]:
-    """Return the messages by stamp, in its order, one for each."""
+def _recorded(
+    bag: BagReader, topic: str, first: str, second: str
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Return the stamps of a topic, in order and each once, and two parts of its messages."""
     messages = {stamp_ns(message): message for _, _, message in bag.messages([topic])}
-    return dict(sorted(messages.items()))
+    stamps = sorted(messages)
+    ones, others = (
+        np.array([_numbers(attrgetter(part)(messages[stamp])) for stamp in stamps])
+        for part in (first, second)
+    )
+    return np.array(stamps, np.int64), ones, others
 
 
-def _xyz(vector: Any) -> list[float]:
-    return [float(vector.x), float(vector.y), float(vector.z)]
-
-
-def _xyzw(quaternion: Any) -> list[float]:
-    return [*_xyz(quaternion), float(quaternion.w)]
+def _numbers(vector: Any) -> list[float]:
+    """Return the numbers of a vector or a quaternion."""
+    return [float(getattr(vector, axis)) for axis in "xyzw" if hasattr(vector, axis)]

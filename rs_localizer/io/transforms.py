@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -147,17 +147,11 @@ class UnusableTransforms:
         return f"{text}; {faults[-1]}" if faults else text
 
 
-@dataclass(slots=True)
-class _Links:
+class _Links(NamedTuple):
     """A frame in its parent over time: for ever, or samples in the order of time."""
 
-    stamps: list[int] = field(default_factory=list)  # ns; none: the only link holds for ever
-    links: list[tuple[str, Transform]] = field(default_factory=list)  # parent, parent_from_child
-
-    def add(self, stamp: int, parent: str, link: Transform) -> None:
-        index = bisect_right(self.stamps, stamp)
-        self.stamps.insert(index, stamp)
-        self.links.insert(index, (parent, link))
+    stamps: list[int]  # ns; none: the only link holds for ever
+    links: list[tuple[str, Transform]]  # parent, parent_from_child
 
     def at(self, stamp: int | None) -> tuple[str, Transform]:
         """Return parent and transform at a time (ns); None: the latest."""
@@ -173,13 +167,11 @@ class _Links:
         before, after = self.stamps[index - 1 : index + 1]
         if parent != other or stamp == before:
             return parent, older
-        return parent, _between(older, newer, (stamp - before) / (after - before))
-
-
-def _between(older: Transform, newer: Transform, ratio: float) -> Transform:
-    turned = so3.log(np.ascontiguousarray(older.rotation.T @ newer.rotation))
-    rotation = older.rotation @ so3.exp(ratio * turned)
-    return Transform(rotation, (1.0 - ratio) * older.translation + ratio * newer.translation)
+        share = (stamp - before) / (after - before)
+        turned = so3.log(np.ascontiguousarray(older.rotation.T @ newer.rotation))
+        rotation = older.rotation @ so3.exp(share * turned)
+        translation = (1.0 - share) * older.translation + share * newer.translation
+        return parent, Transform(rotation, translation)
 
 
 class TransformTree:
@@ -201,13 +193,15 @@ class TransformTree:
             if link is None or not parent or not child or parent == child:
                 continue
             self._parents.add(parent)
-            if static:
-                self._tracks[child] = _Links(links=[(parent, link)])
-                continue
             track = self._tracks.get(child)
-            if track is None or not track.stamps:  # the first, or one that was static
-                track = self._tracks[child] = _Links()
-            track.add(stamp_of(stamped), parent, link)
+            if static or track is None or not track.stamps:  # the first, or one that was static
+                track = self._tracks[child] = _Links([], [])
+            index = 0
+            if not static:
+                stamp = stamp_of(stamped)
+                index = bisect_right(track.stamps, stamp)
+                track.stamps.insert(index, stamp)
+            track.links.insert(index, (parent, link))
 
     def lookup(self, target: str, source: str, stamp_ns: int | None) -> Transform:
         """Return ``target_from_source`` at a time (ns); None: the latest that all links have."""

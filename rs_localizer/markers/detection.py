@@ -86,11 +86,7 @@ class MarkerDetector:
             row += len(board.points)
             if isinstance(board, Charuco):
                 self._on_boards |= {(m.family.kind, m.id) for m in board.markers}
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget how a board lay in the last image."""
-        self._last_board: Array | None = None
+        self._last_board: Array | None = None  # how it lay in the last image
         self._last_board_ns = 0
 
     def detect(self, image: Gray, stamp_ns: int = 0) -> Detections:

@@ -24,7 +24,7 @@ import numpy as np
 from rs_localizer.io.reading import dump_yaml, file_faults, load_yaml, read_text
 from rs_localizer.markers.families import FAMILIES, Family, family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
-from rs_localizer.markers.poses import Pose, finite, quaternion_of_rotation, rotation_of_quaternion
+from rs_localizer.markers.poses import Pose, finite, rotation_of_quaternion
 from rs_localizer.markers.prints import Board, Charuco, Chessboard, Marker
 
 USUAL_FAMILY = FAMILIES["apriltag_36h11"]
@@ -32,10 +32,6 @@ USUAL_FAMILY = FAMILIES["apriltag_36h11"]
 OWN, _BUNDLES, _KALIBR = "rs_localizer", "apriltag_ros", "kalibr"
 FORMATS = (OWN, _BUNDLES, _KALIBR)
 """Formats that are read; our own alone is written."""
-_KEYS = {
-    OWN: ("markers", "boards", "map_frame"),
-    _BUNDLES: ("tag_bundles", "standalone_tags"), _KALIBR: ("target_type",),
-}  # fmt: skip
 SUFFIXES = (".yaml", ".yml", ".json")
 # A parameter of apriltag_ros, which reads it beside the bundles.
 _TAG_FAMILY = "tag_family"
@@ -69,23 +65,20 @@ def read_any(path: Path, kind: Family | None = None) -> tuple[MarkerMap, str]:
         tree = load_yaml(read_text(path))
     try:
         file = _Entry(tree, "the map")
-        name = next((name for name, keys in _KEYS.items() if any(key in file for key in keys)), "")
-        if not name:
-            raise ValueError(f"its format is not known ({', '.join(FORMATS)}): it has {file.names}")
-        if name in (OWN, _KALIBR):
-            return (_read_own_map if name == OWN else _aprilgrid)(file), name
-        kind = kind or family(file.value(_TAG_FAMILY, str, USUAL_FAMILY.name))
-        return MarkerMap(tuple(_bundle(file, kind.name))), name
+        if any(key in file for key in ("markers", "boards", "map_frame")):
+            markers = [_marker(item) for item in file.entries("markers", "marker")]
+            boards = [_board(item) for item in file.entries("boards", "board")]
+            frame = file.value("map_frame", str)
+            file.finish()
+            return MarkerMap(tuple(markers), tuple(boards), frame), OWN
+        if "tag_bundles" in file or "standalone_tags" in file:
+            kind = kind or family(file.value(_TAG_FAMILY, str, USUAL_FAMILY.name))
+            return MarkerMap(tuple(_bundle(file, kind.name))), _BUNDLES
+        if "target_type" in file:
+            return _aprilgrid(file), _KALIBR
+        raise ValueError(f"its format is not known ({', '.join(FORMATS)}): it has {file.names}")
     except ValueError as error:
         raise MarkerMapError(f"{path}: {error}") from error
-
-
-def _read_own_map(file: _Entry) -> MarkerMap:
-    markers = [_marker(item) for item in file.entries("markers", "marker")]
-    boards = [_board(item) for item in file.entries("boards", "board")]
-    frame = file.value("map_frame", str)
-    file.finish()
-    return MarkerMap(tuple(markers), tuple(boards), frame)
 
 
 def _marker(entry: _Entry) -> Marker:
@@ -166,30 +159,27 @@ def _bundle(file: _Entry, name: str) -> Iterator[Marker]:
         )
     (chosen,) = bundles.values()
     for tag in chosen.entries("layout", "tag"):
-        number, size = tag.identify("id"), float(tag.value("size", _NUMBER))
-        place, turn = tag.numbers("xyz"), tag.numbers(("qx", "qy", "qz"))
-        turn.append(float(tag.value("qw", _NUMBER, 1.0)))
+        number = tag.value("id", int)
+        tag.where += f" (id {number})"
+        size = float(tag.value("size", _NUMBER))
+        x, y, z, qx, qy, qz = (
+            float(tag.value(key, _NUMBER, 0.0)) for key in ("x", "y", "z", "qx", "qy", "qz")
+        )
+        turn = qx, qy, qz, float(tag.value("qw", _NUMBER, 1.0))
         with tag.named():
-            pose = Pose(np.array(place), rotation_of_quaternion(turn))
+            pose = Pose(np.array([x, y, z]), rotation_of_quaternion(turn))
             yield Marker.at(name, number, size, pose)
 
 
 _EXPLANATION = """\
-# Where prints are, in the frame map_frame; all lengths in metres.
-#   size: side of the black square of a marker, without the white rim around it
-#   square: side of the squares of a board
+# Where prints are, in the frame map_frame; all lengths in metres (docs/maps.md).
+#   size, square: sides of the black square of a marker, and of the squares of a board
 #   position: middle of the print, x y z in map_frame
-#   quaternion: x y z w (not w x y z), of length 1; turns the print's axes into those of the map.
-#     Axes of a print: x to the right, y up, z out of the paper towards the viewer.
-#     [0, 0, 0, 1]: the same axes as the map. [0.7071, 0, 0, 0.7071]: upright in a map whose z is up
-#     and whose y points into the wall.
-#   shape: offset of each point of a board from flat, x y z along its axes, by calibrate
-#   deviation: standard deviation of the points of a board, m; not given: that of paper
+#   quaternion: x y z w, turns a print's axes into those of the map: x to the right, y up, z out of
+#     the paper towards the viewer. [0.7071, 0, 0, 0.7071]: upright in a map whose z is up and whose
+#     y points into the wall
 #   corners: instead of these three: top left, top right, bottom right, bottom left, from the front
-#   position_deviation, rotation_deviation: standard deviations of a survey along the axes of
-#     map_frame, m and rad
-# Measure what was put up, write it here, and check it: rs_localizer map info FILE;
-# rs_localizer detect names a marker that is not where this file has it.
+# Measure what was put up, write it here, and check it: rs_localizer map info FILE
 """
 
 
@@ -217,16 +207,14 @@ def _marker_entry(marker: Marker) -> dict[str, Any]:
 
 
 def _board_entry(board: Board) -> dict[str, Any]:
-    own: dict[str, Any]
+    entry: dict[str, Any] = {
+        "type": _CHARUCO if isinstance(board, Charuco) else _CHESSBOARD,
+        "columns": board.columns, "rows": board.rows, "square": float(board.square),
+    }  # fmt: skip
     if isinstance(board, Charuco):
-        kind, own = _CHARUCO, {
-            "square": float(board.square), "marker": float(board.marker),
-            "family": board.family.name, "first_id": board.first_id, "legacy": board.legacy,
-        }  # fmt: skip
-    else:
-        kind, own = _CHESSBOARD, {"square": float(board.square)}
-    entry: dict[str, Any] = {"type": kind, "columns": board.columns, "rows": board.rows}
-    entry |= own | _pose_entry(board.pose)
+        entry |= {"marker": float(board.marker), "family": board.family.name}
+        entry |= {"first_id": board.first_id, "legacy": board.legacy}
+    entry |= _pose_entry(board.pose)
     if board.shape is not None:
         entry["shape"] = [_rounded(row) for row in np.round(board.shape, 7)]
     if board.deviation is not None:
@@ -235,7 +223,9 @@ def _board_entry(board: Board) -> dict[str, Any]:
 
 
 def _pose_entry(pose: Pose) -> dict[str, Any]:
-    quaternion = quaternion_of_rotation(pose.rotation)
+    from rs_localizer.core import so3  # kernels: a command that shows its help imports none
+
+    quaternion = so3.quaternion(np.ascontiguousarray(pose.rotation))
     return {"position": _rounded(pose.position), "quaternion": _rounded(quaternion)}
 
 
@@ -277,16 +267,6 @@ class _Entry:
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
             raise _EntryError(f"{self.where}: {name} cannot be {value!r}")
         return value
-
-    def identify(self, name: str) -> int:
-        """Return the id of a tag, and note it for the messages of errors."""
-        number: int = self.value(name, int)
-        self.where += f" (id {number})"
-        return number
-
-    def numbers(self, names: Iterable[str]) -> list[float]:
-        """Return numbers by their names; a missing one is 0."""
-        return [float(self.value(name, _NUMBER, 0.0)) for name in names]
 
     def entries(self, name: str, one: str) -> list[_Entry]:
         listed = self.value(name, (list, type(None)), None) or []

@@ -14,7 +14,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Board, Charuco, Marker
+from rs_localizer.markers.prints import Board, Charuco, Marker, flat_grid
 
 
 class MarkerMapError(ValueError):
@@ -122,12 +122,8 @@ def wall(
         pose: of the middle of the wall: x to the right, y up, z towards the viewer.
     """
     pose = pose or Pose()
-    columns, rows = grid
-    spacing = size + gap
-    made = []
-    for index in range(columns * rows):
-        column, row = index % columns, index // columns
-        offset = np.array([column - 0.5 * (columns - 1), 0.5 * (rows - 1) - row, 0.0]) * spacing
-        place = Pose(pose(offset[None])[0], pose.rotation)
-        made.append(Marker.at(family_name, first_id + index, size, place))
-    return tuple(made)
+    middles = pose(flat_grid(*grid, size + gap))
+    return tuple(
+        Marker.at(family_name, first_id + index, size, Pose(middle, pose.rotation))
+        for index, middle in enumerate(middles)
+    )

@@ -45,13 +45,6 @@ class Pose:
         return np.asarray(points @ self.rotation.T + self.position)
 
 
-def quaternion_of_rotation(rotation: Array) -> Array:
-    """Return the unit quaternion (4,) ``x y z w`` of a rotation matrix (3,3)."""
-    from rs_localizer.core import so3  # kernels: a command that shows its help imports none
-
-    return so3.quaternion(np.ascontiguousarray(rotation))
-
-
 def rotation_of_quaternion(quaternion: ArrayLike) -> Array:
     """Return the rotation matrix (3,3) of ``x y z w``, of unit length up to rounding.
 

@@ -120,13 +120,11 @@ class _Board:
 
     def _check(self, least: tuple[int, int], wanted: str, *lengths: str) -> None:
         """Raise ValueError for a board of unusable size, lengths (names of fields, m) or shape."""
+        size = f"{self.columns}x{self.rows}"
         if self.columns < least[0] or self.rows < least[1]:
-            raise ValueError(f"{wanted}, got {self.columns}x{self.rows}")
+            raise ValueError(f"{wanted}, got {size}")
         if max(self.columns, self.rows) > _MOST_SQUARES:
-            raise ValueError(
-                f"a board may be {_MOST_SQUARES} squares wide and high, got "
-                f"{self.columns}x{self.rows}"
-            )
+            raise ValueError(f"a board may be {_MOST_SQUARES} squares wide and high, got {size}")
         for name in lengths:
             _positive(getattr(self, name), name)
         if self.shape is not None:
@@ -150,7 +148,7 @@ class Chessboard(_Board):
 
     @property
     def flat(self) -> Array:
-        return _grid(self.columns, self.rows, self.square)
+        return flat_grid(self.columns, self.rows, self.square)
 
     @property
     def name(self) -> str:
@@ -195,18 +193,20 @@ class Charuco(_Board):
 
     @property
     def flat(self) -> Array:
-        return _grid(self.columns - 1, self.rows - 1, self.square)
+        return flat_grid(self.columns - 1, self.rows - 1, self.square)
 
     @property
     def markers(self) -> list[Marker]:
         """The markers in the white squares."""
-        middle = 0.5 * np.array([self.columns - 1, self.rows - 1])
-        made = []
-        for index, cell in enumerate(self.cells):
-            x, y = (np.array(cell) - middle) * self.square
-            corners = self.pose(self.marker * _UNIT_SQUARE + np.array([x, -y, 0.0]))
-            made.append(Marker(self.family, self.first_id + index, corners))
-        return made
+        middles = flat_grid(self.columns, self.rows, self.square)
+        return [
+            Marker(
+                self.family,
+                self.first_id + index,
+                self.pose(self.marker * _UNIT_SQUARE + middles[row * self.columns + column]),
+            )
+            for index, (column, row) in enumerate(self.cells)
+        ]
 
     @property
     def name(self) -> str:
@@ -216,7 +216,8 @@ class Charuco(_Board):
 Board = Chessboard | Charuco
 
 
-def _grid(columns: int, rows: int, spacing: float) -> Array:
+def flat_grid(columns: int, rows: int, spacing: float) -> Array:
+    """Return points (n,3) about the origin, row by row from the top left one."""
     y, x = np.mgrid[:rows, :columns].astype(np.float64)
     grid = np.stack([x - 0.5 * (columns - 1), 0.5 * (rows - 1) - y, np.zeros_like(x)], axis=-1)
     return np.asarray(grid.reshape(-1, 3) * spacing)

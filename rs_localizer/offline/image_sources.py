@@ -14,7 +14,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.io.bags import BagReader
 from rs_localizer.io.image_clock import ImageClock
-from rs_localizer.io.images import Image, read_any_image
+from rs_localizer.io.images import Image, read_image
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info, make_image
 from rs_localizer.io.video import Video
@@ -81,7 +81,7 @@ def from_files(files: list[Path], camera: Camera | None, clock: ImageClock) -> I
         assert now is not None  # a clock without a rate has refused
         packed = _FORMATS[file.suffix.lower()]
         compressed = make_image(now, packed, file.read_bytes())
-        image = read_or_refuse(read_any_image, compressed, Reason.BAD_IMAGE)
+        image = read_or_refuse(read_image, compressed, Reason.BAD_IMAGE)
         if isinstance(image, Refusal):
             image = Refusal(image.reason, f"{file.name}: {image.detail}")
         yield Shot(image, _info(camera, now, CAMERA_FRAME), compressed, now)
@@ -167,7 +167,7 @@ def from_bag(
         elif topic in carried:
             yield Carried(topic, recorded_ns, as_tf2(message))
         else:
-            image = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)
+            image = read_or_refuse(read_image, message, Reason.BAD_IMAGE)
             compressed = message if hasattr(message, "format") else None
             info = latest
             if camera is not None:  # the image knows its frame, on which transforms hang

@@ -134,9 +134,8 @@ class AidInput:
 
         if self._buffer is None:
             self._buffer = SampleBuffer()
-        self._buffer.add(
-            reading.stamp_ns, reading.frame, reading.angular_velocity, reading.linear_acceleration
-        )
+        rate, force = reading.angular_velocity, reading.linear_acceleration
+        self._buffer.add(reading.stamp_ns, reading.frame, rate, force)
 
     @property
     def frame(self) -> str:
@@ -186,26 +185,26 @@ class AidInput:
         self, frame: Moment, localized: Callable[[ImuSamples | None], Estimate | Failure]
     ) -> Estimate | Failure:
         """Localize a frame by the tracker, with its samples or with the camera alone."""
-        config, tracker = frame.config, frame.tracker
-        if not self._wanted(config):
+        if not self._wanted(frame.config):
             return localized(None)
-        if tracker.aid is None:
-            unused = Unused(ImuReason.NOT_TRACKING, "the solver is for global shutters")
-            if config.readout_time == 0.0:
-                said = "readout_time is 0: messages have no row"
-                unused = Unused(ImuReason.NO_READOUT_TIME, said)
-            self._count(config, None, unused)
-            return localized(None)
-        start_ns, end_ns = frame.exposure()
-        samples = self._samples(frame, start_ns, end_ns, end_ns + _AROUND_NS)
+        samples = self._samples_of(frame)
         if isinstance(samples, Unused):
-            result = localized(None)
-            self._count(config, tracker, samples)
+            result, unused = localized(None), samples
         else:
             result = localized(samples)
-            self._count(config, tracker, tracker.aid.status.unused)
-            self._compare_gravity(config, samples, result)
+            unused = frame.tracker.aid.status.unused
+            self._compare_gravity(frame.config, samples, result)
+        self._count(frame, unused)
         return result
+
+    def _samples_of(self, frame: Moment) -> ImuSamples | Unused:
+        """Return the readings of a frame, or why there are none."""
+        if frame.config.readout_time == 0.0:
+            return Unused(ImuReason.NO_READOUT_TIME, "readout_time is 0: messages have no row")
+        if frame.tracker.aid is None:
+            return Unused(ImuReason.NOT_TRACKING, "the solver is for global shutters")
+        start_ns, end_ns = frame.exposure()
+        return self._samples(frame, start_ns, end_ns, end_ns + _AROUND_NS)
 
     def _compare_gravity(
         self, config: NodeConfig, samples: ImuSamples, result: Estimate | Failure
@@ -244,11 +243,10 @@ class AidInput:
             text = f"from the IMU {self.frame!r} to the camera {at.camera_frame!r}: {error}"
             return Unused(ImuReason.NO_TRANSFORM, text)
 
-    def _count(self, config: NodeConfig, tracker: Tracker | None, unused: Unused | None) -> None:
+    def _count(self, frame: Moment, unused: Unused | None) -> None:
         self._recently.append(unused)
-        aid = None if tracker is None else tracker.aid
-        self._status = None if aid is None else aid.status
-        self._given_offset = config.imu.time_offset
+        self._status = None if frame.tracker.aid is None else frame.tracker.aid.status
+        self._given_offset = frame.config.imu.time_offset
         oddity = "" if self._status is None else self._status.oddity
         self._odd = self._odd + 1 if oddity else 0
         if self._odd == _LONG:

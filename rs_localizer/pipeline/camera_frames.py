@@ -249,14 +249,13 @@ class CameraFrames(FrameLocalizer):
             self._notice(Notice.DOUBTFUL, text)
         elif not self._scale_is_odd:  # which also looks like a moved part of the map
             names = () if self._tags is None else self._tags.names
-            stale = self._tracker.stale(cloud.points)
-            gone = stale_landmarks(cloud, stale, result, self._camera, names)
+            gone = stale_landmarks(cloud, self._tracker.stale(cloud.points), names)
             moved = moved_landmarks(cloud, self._tracker.moved, names)
             for said in filter(None, (gone, moved)):
                 self._notice(Notice.STALE_LANDMARKS, said)
         if result.left_out:
             self._notice(Notice.DOUBTFUL, result.left_out)
-        return self._result(cloud, result, moment, self._config.readout_time_deviation)
+        return self._result(cloud, result, moment)
 
     def _delayed(self, newest: Localized | Refusal, stamp_ns: int) -> Localized | Refusal | None:
         """Return the result that ``output_lag`` asks for, once the frame of this stamp has come.
@@ -307,5 +306,4 @@ class CameraFrames(FrameLocalizer):
         if found is None:
             return None
         cloud = replace(self._newest, stamp_ns=stamp_ns)
-        moment = PublishedMoment(stamp_ns, 0.0)
-        return self._result(cloud, found, moment, self._config.readout_time_deviation)
+        return self._result(cloud, found, PublishedMoment(stamp_ns, 0.0))

@@ -5,15 +5,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.arrays import BoolArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import centre_of, off_centre
 from rs_localizer.core.reasons import Notice
-from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.moved_part import MovedPart
 from rs_localizer.io.clouds import Correspondences
 
@@ -73,102 +71,18 @@ def oddities(
 
 # Most landmarks that are named.
 _NAMED = 12
-# So many corners of a marker that is elsewhere are never matched; others may be, by chance.
-_OF_MARKER = 2
-# Corners are those of a square: what is out of it by such a share is rounding, or no marker.
-_FLAT, _ROUND = 0.01, np.array([1.0, -1.0, 1.0, -1.0])
-# A marker is turned if its corners are less alike than this, the cosine of 45 deg: halfway to where
-# the next corner is expected.
-_ALIKE = 0.7
-# A way along the line of sight, but for a deviation of a fifth: another size looks like that, if it
-# is by this share of the distance at least, as which a pixel of a small marker looks.
-_ALONG, _RESIZED = 1.2, 0.05
 
 
-def stale_landmarks(
-    cloud: Correspondences, gone: BoolArray, found: Estimate, camera: Camera,
-    names: Sequence[str] = (),
-) -> str:  # fmt: skip
+def stale_landmarks(cloud: Correspondences, gone: BoolArray, names: Sequence[str] = ()) -> str:
     """Name the points that are gone from a map in a sentence; empty if there are none.
 
-    Markers, of which four ids in a row are the corners, are also said to lie where the frame shows
-    them.
-
     Args:
-        found: of the frame.
         names: of ids; none: they are their own.
     """
     if not gone.any():
         return ""
     count, listed = _names(cloud, gone, names)
-    said = f"{count} landmarks in view are often seen and never matched: {listed}"
-    markers = _Markers.of(cloud, names)
-    for k in np.flatnonzero(gone[markers.rows].sum(axis=1) >= _OF_MARKER).tolist():
-        said += f"; {markers.names[k]} {_elsewhere(k, markers, cloud, found, camera)}"
-    return said
-
-
-def _ids_of(cloud: Correspondences) -> IntArray | None:
-    """Return the ids of a cloud's points, if it has any."""
-    return cloud.table["id"].astype(np.int64) if "id" in (cloud.table.dtype.names or ()) else None
-
-
-class _Markers(NamedTuple):
-    """The markers of a cloud: squares of which four ids in a row are the corners."""
-
-    rows: IntArray  # (m,4) of corners in the cloud
-    centres: Array  # (m,3) as the map has them
-    names: list[str]
-
-    @classmethod
-    def of(cls, cloud: Correspondences, names: Sequence[str]) -> _Markers:
-        own = _ids_of(cloud)
-        ids, rows = np.unique(np.zeros(0, np.int64) if own is None else own, return_index=True)
-        first = np.flatnonzero((ids[:-3] % 4 == 0) & (ids[3:] == ids[:-3] + 3))
-        rows = rows[first[:, None] + np.arange(4)]
-        points = cloud.points[rows]
-        out = np.linalg.norm(np.einsum("mki,k->mi", points, _ROUND), axis=1)
-        square = out < _FLAT * np.linalg.norm(points[:, 1] - points[:, 0], axis=1)
-        called = [
-            names[corner] if names else f"the marker {corner} to {corner + 3}"
-            for corner in ids[first[square]].tolist()
-        ]
-        return cls(rows[square], points[square].mean(axis=1), called)
-
-
-def _elsewhere(
-    marker: int, markers: _Markers, cloud: Correspondences, found: Estimate, camera: Camera
-) -> str:
-    """Say where a marker is of which the map has other corners.
-
-    It is so small that its image is an affine one, of which the longest axis is not foreshortened:
-    its distance is known but for its size, which the map has.
-    """
-    rows, centres = markers.rows[marker], markers.centres
-    corners, pixels = cloud.points[rows], cloud.pixels[rows]
-    rotations, translations = found.at_rows(camera.row_time(pixels))
-    eye = -np.einsum("nji,nj->ni", rotations, translations).mean(axis=0)
-    away = np.einsum("nji,nj->ni", rotations, camera.bearings(pixels))
-    shape, axis = corners - centres[marker], away.mean(axis=0)
-    seen, expected = (each / (each @ axis)[:, None] for each in (away, corners - eye))
-    middle = seen.mean(axis=0)
-    across, expected = seen - middle, expected - expected.mean(axis=0)
-    if np.linalg.norm(across) < _FLAT * np.linalg.norm(expected):
-        return "is seen as one point"
-    place = eye + middle / np.linalg.norm(np.linalg.lstsq(shape, across, _FLAT)[0], 2)
-    far, side = np.linalg.norm(centres - place, axis=1), np.linalg.norm(shape[0])
-    way, nearest = float(far[marker]), int(np.argmin(far))
-    alike = np.sum(across * expected) / (np.linalg.norm(across) * np.linalg.norm(expected))
-    if way < side and alike < _ALIKE:
-        return "is turned there, or its corners come in another order"
-    x, y, z = place
-    said = f"lies near ({x:.2f}, {y:.2f}, {z:.2f}), {way:.2g} m from there"
-    if nearest != marker and far[nearest] < side:
-        return f"{said}, where the map has {markers.names[nearest]}"
-    seen_at, mapped = (float(np.linalg.norm(each - eye)) for each in (place, centres[marker]))
-    if way < _ALONG * abs(seen_at - mapped) and abs(seen_at - mapped) > _RESIZED * mapped:
-        said += f", or measures {mapped / seen_at:.2g} times what the map says"
-    return said
+    return f"{count} landmarks in view are often seen and never matched: {listed}"
 
 
 def moved_landmarks(
@@ -191,11 +105,11 @@ def moved_landmarks(
 
 def _names(cloud: Correspondences, some: BoolArray, names: Sequence[str]) -> tuple[int, str]:
     """Return how many landmarks some points are, and the first of their names."""
-    rows, ids = np.flatnonzero(some), _ids_of(cloud)
-    if ids is None:
+    rows = np.flatnonzero(some)
+    if "id" not in (cloud.table.dtype.names or ()):
         points = np.unique(cloud.points[rows], axis=0)
         own = [f"({x:.2f}, {y:.2f}, {z:.2f})" for x, y, z in points]
     else:
-        of = np.unique(ids[rows]).tolist()
+        of = np.unique(cloud.table["id"][rows]).tolist()
         own = list(dict.fromkeys(names[each] if names else str(each) for each in of))
     return len(own), ", ".join(own[:_NAMED]) + (" ..." if len(own) > _NAMED else "")

@@ -226,21 +226,17 @@ class FrameLocalizer(ABC):
         self._landmarks.use_map(landmarks)
 
     def _result(
-        self, cloud: Correspondences, estimate: Estimate, moment: PublishedMoment,
-        deviation: float = 0.0,
-    ) -> Localized | Refusal:  # fmt: skip
+        self, cloud: Correspondences, estimate: Estimate, moment: PublishedMoment
+    ) -> Localized | Refusal:
         """Return pose and twist of ``base_frame`` at a moment.
 
         Args:
             cloud: with the rows of the estimate, or with none.
             estimate: of the first camera.
             moment: for which they are valid.
-            deviation: s, of the readout time as it is given.
         """
-        pose, twist = published_motion(
-            estimate, moment, self._config, next(iter(self._cameras.values())), deviation,
-            self.shutter,
-        )  # fmt: skip
+        first = next(iter(self._cameras.values()))
+        pose, twist = published_motion(estimate, moment, self._config, first, self.shutter)
         seen = np.asarray(estimate.inliers) if len(cloud.table) else np.zeros(0, np.bool_)
         return self.mounted(
             Localized(

@@ -5,27 +5,22 @@
 The node and the offline ``rs_localizer detect --features`` run this one class.
 """
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
 from rs_localizer.config import FeatureConfig
 from rs_localizer.core.reasons import Reason
 from rs_localizer.features.extraction import FeatureExtractor, Features
 from rs_localizer.io.clouds import make_cloud, make_rows
-from rs_localizer.io.images import Image, read_any_image
+from rs_localizer.io.images import Image, read_image
 from rs_localizer.io.messages import Make
 from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Extracted:
-    """An image and its keypoints; true in a condition."""
+class Extracted(NamedTuple):
+    """An image and its keypoints."""
 
     image: Image
     features: Features
-
-    def __bool__(self) -> Literal[True]:
-        return True
 
 
 def keypoints(extracted: Extracted, make: Make) -> Any:
@@ -54,7 +49,7 @@ class FrameExtractor:
 
     def take(self, message: Any) -> Extracted | Refusal:
         """Look for keypoints in a sensor_msgs/Image or CompressedImage."""
-        image = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)
+        image = read_or_refuse(read_image, message, Reason.BAD_IMAGE)
         return image if isinstance(image, Refusal) else self.extract(image)
 
     def extract(self, image: Image) -> Extracted:

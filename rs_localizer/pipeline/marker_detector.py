@@ -5,21 +5,21 @@
 The node and the offline ``rs_localizer detect`` run this one class.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rs_localizer.config import DetectorConfig
 from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.io.clouds import make_cloud, make_rows, point_fields
-from rs_localizer.io.images import Image, read_any_image
+from rs_localizer.io.images import Image, read_image
 from rs_localizer.io.messages import Make
 from rs_localizer.markers.detection import Detections, MarkerDetector
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unheard
+from rs_localizer.pipeline.tags import listed
 from rs_localizer.pipeline.what_fits import Mistakes
 
 # Single precision is what RViz shows: 3e-5 px at the rim of an image, and 0.1 mm at the end of a
@@ -32,16 +32,12 @@ _LITTLE, _TIMES, _MORE = 12, 2, 8
 _LEAST_SIDE = 10.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Detected:
-    """An image in which markers were looked for; true in a condition."""
+class Detected(NamedTuple):
+    """An image in which markers were looked for."""
 
     image: Image
     detections: Detections
     map: MarkerMap
-
-    def __bool__(self) -> Literal[True]:
-        return True
 
 
 def correspondences(detected: Detected, make: Make) -> Any:
@@ -83,7 +79,7 @@ class FrameDetector:
 
     def take(self, message: Any) -> Detected | Refusal:
         """Look for markers in a sensor_msgs/Image or CompressedImage."""
-        image = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)
+        image = read_or_refuse(read_image, message, Reason.BAD_IMAGE)
         return image if isinstance(image, Refusal) else self.detect(image)
 
     def detect(self, image: Image) -> Detected:
@@ -94,8 +90,7 @@ class FrameDetector:
             (Notice.REPEATED_MARKERS, detections.repeated, "more than once: not used"),
         ):
             if markers:
-                shown = ", ".join(markers[:8]) + (", ..." if len(markers) > 8 else "")
-                self._notice(name, f"the image shows {shown}, {text}")
+                self._notice(name, f"the image shows {listed(markers)}, {text}")
         for fault in detections.faults:
             self._notice(Notice.OTHER_BOARD, fault)
         if len(detections.ids) < _LITTLE or detections.unknown:

@@ -99,7 +99,7 @@ def with_timing(
 
 def published_motion(
     estimate: Estimate, moment: PublishedMoment, config: NodeConfig, camera: Camera,
-    deviation: float, watch: ShutterWatch,
+    watch: ShutterWatch,
 ) -> tuple[BodyPose, Twist | None]:  # fmt: skip
     """Return pose and twist of the camera at a moment; no twist where frames tell none.
 
@@ -108,7 +108,6 @@ def published_motion(
         moment: for which they are valid.
         config: settings.
         camera: the first one.
-        deviation: s, of the readout time as it is given.
         watch: of the shutter; before a global one an image says nothing of velocities.
     """
     readout_time, (_, tau, there) = estimate.span, moment
@@ -117,6 +116,7 @@ def published_motion(
     motion, at = (estimate, tau) if there is None else (there, 0.0)
     pose = pose_at(motion, at)
     twist = twist_at(motion, at, readout_time) if moving else None
+    deviation = 0.0 if config.of_cameras else config.readout_time_deviation
     late = max(deviation, watch.error)
     if twist is not None and late > 0.0:
         # The middle row comes later where the readout takes longer; the first one does not.

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tags that other detectors have found become correspondences by a map of markers."""
 
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.io.clouds import Correspondences, make_rows, point_fields
-from rs_localizer.io.detections import TagDetections, read_detections
+from rs_localizer.io.detections import read_detections
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse
@@ -44,21 +44,23 @@ class Tags:
         detections = read_or_refuse(read_detections, message, Reason.BAD_DETECTIONS)
         if isinstance(detections, Refusal):
             return detections
-        if len(detections.ids) == 0:
+        if not detections.names:
             return Refusal(Reason.EMPTY_CLOUD, "the detector has found no tag")
-        rows = self._known(detections)
+        names = [f"{family} {number}" for family, number in detections.names]
+        rows = self._known(detections.names, names)
         if not (rows >= 0).any():
-            names = _listed(detections, np.arange(len(rows)))
-            return Refusal(Reason.NO_MATCHES, f"the marker map has none of {names}")
-        detections = replace(detections, ids=rows[rows >= 0], corners=detections.corners[rows >= 0])
-        return self._correspondences(detections)
+            return Refusal(Reason.NO_MATCHES, f"the marker map has none of {listed(names)}")
+        corners = detections.corners[rows >= 0]
+        scores = np.repeat(np.linalg.norm(np.roll(corners, -1, 1) - corners, axis=2).min(axis=1), 4)
+        ids = (rows[rows >= 0][:, None] + np.arange(4)).ravel()
+        points, pixels = self._points[ids], corners.reshape(-1, 2)
+        table = make_rows(point_fields("<f8"), [*points.T, *pixels.T, scores, ids])
+        frame = self._map.map_frame
+        return Correspondences(detections.stamp_ns, frame, points, pixels, scores, 0, table)
 
-    def _known(self, detections: TagDetections) -> IntArray:
+    def _known(self, tags: list[tuple[str, int]], names: list[str]) -> IntArray:
         """Return the first row of each tag (m,) in the map's points; -1 if it is not used."""
-        keys = [
-            (self._kinds.get(name, name), number)
-            for name, number in zip(detections.families, detections.ids.tolist(), strict=True)
-        ]
+        keys = [(self._kinds.get(family, family), number) for family, number in tags]
         rows = np.array([self._rows.get(key, -1) for key in keys], np.int64)
         repeated = np.array([keys.count(key) > 1 for key in keys], bool)
         for name, some, text in (
@@ -66,20 +68,10 @@ class Tags:
             (Notice.REPEATED_MARKERS, repeated, "more than once: not used"),
         ):
             if some.any():
-                listed = _listed(detections, np.flatnonzero(some))
-                self._notice(name, f"the detector has found {listed}, {text}")
+                found = listed([names[k] for k in np.flatnonzero(some)])
+                self._notice(name, f"the detector has found {found}, {text}")
         rows[repeated] = -1
         return rows
-
-    def _correspondences(self, detections: TagDetections) -> Correspondences:
-        sides = np.linalg.norm(np.roll(detections.corners, -1, axis=1) - detections.corners, axis=2)
-        scores = np.repeat(sides.min(axis=1), 4)
-        ids = (detections.ids[:, None] + np.arange(4)).ravel()
-        points, pixels = self._points[ids], detections.corners.reshape(-1, 2)
-        table = make_rows(point_fields("<f8"), [*points.T, *pixels.T, scores, ids])
-        return Correspondences(
-            detections.stamp_ns, self._map.map_frame, points, pixels, scores, 0, table
-        )
 
 
 def read_tags(file: str, notice: Notify) -> Tags:
@@ -91,6 +83,6 @@ def read_tags(file: str, notice: Notify) -> Tags:
     return Tags(read_marker_map(Path(file).expanduser()), notice)
 
 
-def _listed(detections: TagDetections, some: IntArray) -> str:
-    names = [f"{detections.families[k]} {detections.ids[k]}" for k in some.tolist()]
+def listed(names: Sequence[str]) -> str:
+    """Return the first of some names in a sentence."""
     return ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")

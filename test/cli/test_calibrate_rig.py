@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.cli.commands import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.rigs import RigParts, mounted_lenses, node_parameters, read_camchain
-from rs_localizer.settings import build, load_params_file, write_camera_file
+from rs_localizer.settings import build, load_params_file, write_parameters
 
 K = np.array([[420.0, 0.0, 320.0], [0.0, 422.0, 240.0], [0.0, 0.0, 1.0]])
 LENS = [-0.12, 0.04, 0.001, -0.0015]
@@ -39,7 +39,7 @@ def rig(tmp_path_factory):
 
 
 def recorded(folder, rig, *words):
-    write_camera_file(folder / "chain.yaml", node_parameters(rig), mounted_lenses(rig))
+    write_parameters(folder / "chain.yaml", node_parameters(rig), mounted_lenses(rig))
     record(folder / "pair", "--rig", folder / "chain.yaml", "--noise", "0.3", *words)
     return str(folder / "pair")
 

@@ -21,7 +21,7 @@ from rs_localizer.io.recording import MARKER_MAP
 from rs_localizer.io.rigs import RigParts, mounted_lenses, node_parameters
 from rs_localizer.io.trajectories import read_motions
 from rs_localizer.markers.map_files import read_marker_map
-from rs_localizer.settings import write_camera_file
+from rs_localizer.settings import write_parameters
 
 K = np.array([[260.0, 0.0, 159.5], [0.0, 260.0, 119.5], [0.0, 0.0, 1.0]])
 # The second camera is upside down, 10 cm beside the first.
@@ -43,7 +43,7 @@ def film(tmp_path_factory):
     write_calibration(folder / "camera.yaml", camera)
     mounts = {"up": (np.eye(3), np.zeros(3)), "down": (OVER, -OVER @ CENTRE)}
     parts = RigParts({"up": camera, "down": camera}, mounts, {"down": 0.2})
-    write_camera_file(folder / "chain.yaml", node_parameters(parts), mounted_lenses(parts))
+    write_parameters(folder / "chain.yaml", node_parameters(parts), mounted_lenses(parts))
 
     def film(which: str, name: str, *words: str) -> Path:
         out = folder / f"{which}_{name}"

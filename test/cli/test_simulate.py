@@ -21,7 +21,7 @@ from rs_localizer.io.camera_files import lens_parameters
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.settings import load_params_file, write_camera_file
+from rs_localizer.settings import load_params_file, write_parameters
 
 TURN = ("--angular-velocity", "0.5", "-1", "2", "--linear-velocity", "0.2", "0", "0")
 SHORT = ("--duration", "1", "--points", "60")
@@ -69,7 +69,7 @@ def test_lens_and_shutter_of_a_file_go_on_to_the_next_command(tmp_path, monkeypa
     K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
     lens = Camera(640, 480, K, [-0.2, 0.05, 0.001, -0.001])
     shutter = {"readout_time": 0.025, "scan_direction": "left_to_right"}
-    write_camera_file(Path("camera.yaml"), shutter, lens_parameters(lens))
+    write_parameters(Path("camera.yaml"), shutter, lens_parameters(lens))
     words = ("--camera", "camera.yaml", "--scan-direction", "bottom_to_top", "--duration", "0.2")
     assert simulate(Path("my bag"), *words) == 0
     *_, line = capsys.readouterr().out.splitlines()

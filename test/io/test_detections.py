@@ -24,15 +24,14 @@ def message(corners=CORNERS, **changed):
 def test_a_tag():
     found = read_detections(message())
     assert found.stamp_ns == 3_000_000_005
-    assert found.families == ("tag36h11",)
-    assert found.ids.tolist() == [7]
+    assert found.names == [("tag36h11", 7)]
     expected = [(10, 10), (40, 10), (40, 40), (10, 40)]
     np.testing.assert_array_equal(found.corners[0], expected)
 
 
 @pytest.mark.parametrize("family", ["tag36h11", "tag_36h11", "36h11"])
 def test_families_have_one_name(family):
-    assert read_detections(message(family=family)).families == ("tag36h11",)
+    assert read_detections(message(family=family)).names == [("tag36h11", 7)]
 
 
 @pytest.mark.parametrize(

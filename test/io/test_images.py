@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.io.image_clock import ImageClock, readout_fault
-from rs_localizer.io.images import read_compressed_image, read_image
+from rs_localizer.io.images import read_image
 from rs_localizer.io.messages import MessageError
 
 HEADER = SimpleNamespace(stamp=SimpleNamespace(sec=3, nanosec=4), frame_id="camera")
@@ -148,16 +148,16 @@ PNG = cv2.imencode(".png", SMOOTH)[1].tobytes()
 
 
 def test_jpeg_and_png():
-    np.testing.assert_array_equal(read_compressed_image(compressed(PNG, "png")).pixels, SMOOTH)
-    found = read_compressed_image(compressed(JPEG, "mono8; jpeg compressed mono8"))
+    np.testing.assert_array_equal(read_image(compressed(PNG, "png")).pixels, SMOOTH)
+    found = read_image(compressed(JPEG, "mono8; jpeg compressed mono8"))
     np.testing.assert_allclose(found.pixels, SMOOTH, atol=6)
-    padded = read_compressed_image(compressed(JPEG + bytes(500)))  # of drivers that send a buffer
+    padded = read_image(compressed(JPEG + bytes(500)))  # of drivers that send a buffer
     np.testing.assert_array_equal(padded.pixels, found.pixels)
     deep = SMOOTH.astype(np.uint16) << 4
     deep_png = cv2.imencode(".png", deep)[1].tobytes()
-    np.testing.assert_array_equal(read_compressed_image(compressed(deep_png)).pixels, SMOOTH)
+    np.testing.assert_array_equal(read_image(compressed(deep_png)).pixels, SMOOTH)
     color = cv2.imencode(".png", np.dstack([SMOOTH] * 3))[1].tobytes()
-    np.testing.assert_allclose(read_compressed_image(compressed(color)).pixels, SMOOTH, atol=1)
+    np.testing.assert_allclose(read_image(compressed(color)).pixels, SMOOTH, atol=1)
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,7 @@ def test_jpeg_and_png():
 )
 def test_bad_compressed_images(data, name, text):
     with pytest.raises(MessageError, match=text):
-        read_compressed_image(compressed(data, name))
+        read_image(compressed(data, name))
 
 
 def chunk(kind: bytes, body: bytes) -> bytes:
@@ -188,10 +188,10 @@ def test_an_animated_png_is_read_as_its_still_image():
     animated += rows + chunk(b"fcTL", control) + rows + chunk(b"IEND", b"")
     program = (
         "import sys; from types import SimpleNamespace as N\n"
-        "from rs_localizer.io.images import read_compressed_image\n"
+        "from rs_localizer.io.images import read_image\n"
         "header = N(stamp=N(sec=0, nanosec=0), frame_id='camera')\n"
         "data = sys.stdin.buffer.read()\n"
-        "print(read_compressed_image(N(header=header, format='png', data=data)).pixels.shape)\n"
+        "print(read_image(N(header=header, format='png', data=data)).pixels.shape)\n"
     )
     ended = subprocess.run([sys.executable, "-c", program], input=animated, capture_output=True)
     assert ended.returncode == 0, ended.stderr

@@ -60,7 +60,7 @@ def test_poses_round_trip(tmp_path, name):
     [
         (f"1 {POSE}\n2 {POSE} 9\n", r"line 2: expected .* t x y z qx qy qz qw, found '2 0.1"),
         ("1 nan 0 0 0 0 0 1\n", r"line 1: .*finite.* found '1 nan"),
-        (f"1.5 {POSE}\n1.5 1{POSE}\n", r"line 2: the time 1.5 was there before, with other"),
+        (f"1.5 {POSE}\n1.5 1{POSE}\n", r"the time 1.5 is there twice, with different"),
         ("1 0 0 0 0 0 0 0.5\n", r"the quaternion of pose 1 has norm 0.5, not 1"),
         ("# only a title\n", r"a.txt holds no line of numbers"),
     ],

@@ -21,7 +21,7 @@ from rs_localizer.io.trajectories import read_tum
 from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.pipeline.rig_frames import RigFrames
-from rs_localizer.settings import build, camera_values, write_camera_file
+from rs_localizer.settings import build, camera_values, write_parameters
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, simulate_frames
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings
@@ -174,7 +174,7 @@ def test_a_new_camera_counts_from_the_next_frame_on(make_camera_info):
 
 def test_the_lens_of_a_camera_file_takes_the_place_of_camera_info(tmp_path, make_camera_info):
     file, K = tmp_path / "camera.yaml", np.array([[400.0, 0, 319], [0, 400, 239], [0, 0, 1]])
-    write_camera_file(file, {}, lens_parameters(Camera(640, 480, K)))
+    write_parameters(file, {}, lens_parameters(Camera(640, 480, K)))
     frames = CameraFrames(NodeConfig(camera_file=str(file)))
     frames.load_files()
     frames.calibrate(read_camera_info(make_camera_info(width=640, height=480)))
@@ -193,7 +193,7 @@ def test_the_lenses_of_a_rig_are_those_of_its_file(tmp_path, make_camera_info):
     cameras = {"a": a, "b": replace(a, K=K + np.diag([9.0, 9.0, 0.0]))}
     poses = dict.fromkeys(cameras, (np.eye(3), np.array([0.1, 0.0, 0.0])))
     parts = RigParts(cameras, poses, {"b": 0.01})
-    write_camera_file(file, node_parameters(parts), mounted_lenses(parts))
+    write_parameters(file, node_parameters(parts), mounted_lenses(parts))
     assert read_camchain(file).time_offset == {"a": 0.0, "b": 0.01}
     frames = RigFrames(build({**camera_values(file), "camera_file": str(file)}))
     frames.load_files()

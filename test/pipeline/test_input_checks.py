@@ -2,12 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is odd about a frame is said, and what is usual is not."""
 
-import re
-
 import numpy as np
 import pytest
 
-from benchmarks import kinds
 from rs_localizer.core.camera import Camera, Roi
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.pipeline.cloud_checks import oddities, stale_landmarks
@@ -63,41 +60,3 @@ def test_landmarks_that_are_gone_are_named():
     assert said(seen, table["id"] > 7, tuple("abcdefghij")).endswith("matched: i, j")
     seen.table["id"] = 2 * np.arange(40)
     assert said(seen, np.ones(40, np.bool_)).endswith(" 20, 22 ...")
-
-
-def swapped(corners: np.ndarray) -> None:
-    corners[[7, 10]] = corners[[10, 7]]
-
-
-def moved(corners: np.ndarray) -> None:
-    corners[7] += [0.0, 0.2, 0.1]
-
-
-def larger(corners: np.ndarray) -> None:
-    corners[7] += corners[7] - corners[7].mean(axis=0)
-
-
-def turned(corners: np.ndarray) -> None:
-    corners[7] = np.roll(corners[7], 1, axis=0)
-
-
-@pytest.mark.parametrize(
-    ("fault", "said"),
-    [
-        (swapped, "m from there, where the map has the marker 40 to 43"),
-        (moved, r"0\.2[123]? m from there"),
-        (larger, r"or measures 0\.(49|5|51) times what the map says"),
-        (turned, "the marker 28 to 31 is turned there"),
-    ],
-)
-def test_markers_that_are_elsewhere_are_said_to_lie_there(fault, said):
-    """Markers of 20 cm on a wall 2 m away, by 0.3 px."""
-
-    def told(seen: kinds.Seen, rng: np.random.Generator) -> kinds.Seen:
-        corners = seen.points.reshape(-1, 4, 3).copy()
-        fault(corners)
-        return seen._replace(points=corners.reshape(-1, 3))
-
-    kind = kinds.Kind("markers elsewhere", kinds._wall, told, noise=0.3)
-    texts = kinds.judged(kind, 1, 1, 25).texts
-    assert re.search(said, texts["stale_landmarks"]), texts

@@ -18,7 +18,7 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.detections import APRILTAG_TYPE, ISAAC_TYPE, read_detections
-from rs_localizer.io.images import read_any_image
+from rs_localizer.io.images import read_image
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
 from rs_localizer.markers.detection import MarkerDetector
@@ -74,7 +74,7 @@ def walls(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def images(walls: Path) -> list[tuple[Any, np.ndarray]]:
     with open_bag(walls) as bag:
         (topic,) = (t for t, kind in bag.topics.items() if kind.endswith("Image"))
-        return [(m.header, read_any_image(m).pixels) for _, _, m in bag.messages([topic])]
+        return [(m.header, read_image(m).pixels) for _, _, m in bag.messages([topic])]
 
 
 def of_apriltag(walls: Path) -> list[Any]:

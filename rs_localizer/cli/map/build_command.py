@@ -31,7 +31,7 @@ if WORKING:
     from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME
     from rs_localizer.io.trajectories import Trajectory, write_tum
     from rs_localizer.markers.map_files import read_marker_map
-    from rs_localizer.settings import build, write_camera_file
+    from rs_localizer.settings import build, write_parameters
     from rs_localizer.tools.mapping.anchors import Anchors, Distance, PointSight
     from rs_localizer.tools.mapping.build import Built, Given, build_map
     from rs_localizer.tools.mapping.report import advice, rows
@@ -155,7 +155,7 @@ def _write(out: Path, built: Built, looked: Looked) -> None:
     camera = built.camera
     # A file has the lens of a whole image; of a part of it, camera_info says which.
     whole = camera.roi is None and camera.binning == (1, 1)
-    write_camera_file(out / CAMERA, shutter, lens_parameters(camera) if whole else {})
+    write_parameters(out / CAMERA, shutter, lens_parameters(camera) if whole else {})
     stamps, positions, quaternions = built.middle_rows([view.stamp_ns for view in looked.views])
     write_tum(out / POSES, Trajectory(stamps, positions, quaternions), ["of the middle rows"])
 

@@ -35,17 +35,6 @@ _DAMAGES = (
 )  # fmt: skip
 
 
-def read_npz(path: Path, frame: str) -> Map:
-    """Read a map; raises MapError for anything that is none, OSError as any file."""
-    with path.open("rb") as file, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # NumPy warns of old headers
-        arrays = _arrays(file)
-    return make_map(
-        arrays["points"], arrays.get("ids"), arrays.get("descriptors"), frame,
-        arrays.get("covariances"), arrays.get("error_modes"),
-    )  # fmt: skip
-
-
 def _arrays(file: IO[bytes]) -> dict[str, NDArray[Any]]:
     try:
         with zipfile.ZipFile(file) as archive:
@@ -94,6 +83,9 @@ def read_map_file(path: Path | str, frame: str, database: Path | None = None) ->
             raise MapError("it is no plain file: a pipe or device may have no end")
         if database is not None:
             raise MapError("it is not a folder of COLMAP, which alone has a database")
-        return read_npz(file, frame)
+        with file.open("rb") as opened, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # NumPy warns of old headers
+            arrays = _arrays(opened)
+        return make_map(frame=frame, **dict.fromkeys(_ARRAYS) | arrays)
     except MapError as error:
         raise MapError(f"{path}: {error}") from error

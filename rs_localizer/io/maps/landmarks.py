@@ -69,13 +69,9 @@ class Map:
 
     def equals(self, other: Map) -> bool:
         """Return True if both maps are the same to the last bit, in the same frame."""
-        return (
-            self.frame == other.frame
-            and np.array_equal(self.points, other.points)
-            and _equal(self.ids, other.ids)
-            and _equal(self.descriptors, other.descriptors)
-            and _equal(self.covariances, other.covariances)
-            and _equal(self.error_modes, other.error_modes)
+        parts = ("points", "ids", "descriptors", "covariances", "error_modes")
+        return self.frame == other.frame and all(
+            _equal(getattr(self, part), getattr(other, part)) for part in parts
         )
 
     @property
@@ -126,7 +122,9 @@ def make_map(
         if covariances.shape != (len(points), 3, 3) or covariances.dtype.kind not in "fiu":
             raise MapError(f"covariances must be ({len(points)},3,3), found {covariances.shape}")
         covariances = np.ascontiguousarray(covariances, dtype=np.float64)
-        _check_covariances(covariances)
+        variances = covariances.diagonal(axis1=1, axis2=2)
+        if np.any(variances < 0.0) or np.any(np.isinf(covariances)):
+            raise MapError("covariances must have finite variances of 0 or more (NaN: not known)")
     if error_modes is not None:
         shape, kind = error_modes.shape, error_modes.dtype.kind
         if len(shape) != 3 or shape[:2] != points.shape or kind not in "fiu":
@@ -147,17 +145,6 @@ def make_map(
     return Map(points, ids, descriptors, frame, dropped, covariances, error_modes)
 
 
-def _check_covariances(covariances: Array) -> None:
-    variances = covariances.diagonal(axis1=1, axis2=2)
-    bad = (variances < 0.0).any(axis=1) | np.isinf(covariances).any(axis=(1, 2))
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise MapError(
-            f"covariances must have finite variances of 0 or more (NaN: not known), found "
-            f"{variances[row].tolist()} m^2 at index {row}"
-        )
-
-
 def _equal(one: NDArray[Any] | None, other: NDArray[Any] | None) -> bool:
     if one is None or other is None:
         return one is other
@@ -170,9 +157,8 @@ def _check_ids(ids: NDArray[Any]) -> None:
             "ids must lie between 0 and 4294967295 or between -2147483648 and 2147483647, the "
             f"integers of a PointCloud2; found {ids.min()} to {ids.max()}"
         )
-    ordered = np.sort(ids)
-    repeated = np.unique(ordered[1:][ordered[1:] == ordered[:-1]])
-    if len(repeated):
+    known, counts = np.unique(ids, return_counts=True)
+    if len(repeated := known[counts > 1]):
         raise MapError(
             f"{len(repeated)} ids stand for several landmarks each, the first of them is "
             f"{repeated[0]}"

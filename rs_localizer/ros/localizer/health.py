@@ -28,7 +28,6 @@ from rs_localizer.ros.node.diagnostics import (
 )
 from rs_localizer.ros.node.statistics import Summary, Told
 from rs_localizer.ros.node.subscriptions import Silence
-from rs_localizer.shutter_watch import MeasuredReadout
 
 DEVIATION = "Position deviation (cm)"
 """Name of a value: root of the sum over the axes, of the last pose."""
@@ -99,14 +98,6 @@ def imu_oddity(state: AidState | None) -> dict[str, str]:
     return oddities
 
 
-def readout_values(seen: MeasuredReadout | None) -> dict[str, str]:
-    """Return the readout time as the camera's motion shows it."""
-    if seen is None:
-        return {}
-    readout, deviation = 1e3 * seen.readout_time, 1e3 * seen.deviation
-    return {"Readout time seen (ms)": f"{readout:.2f} +- {deviation:.2f}"}
-
-
 # Frames in a row without a pose after which the camera is lost.
 _LOST = 5
 # A frame that is worked on for longer (s) holds up the others.
@@ -130,16 +121,13 @@ def of_interest(silence: Mapping[str, Silence], missing: Sequence[str]) -> dict[
 
     Frames come as correspondences or as keypoints; only keypoints need a map.
     """
-    coming = any(item.heard for item in _of_frames(silence))
-
-    def counts(name: str, item: Silence) -> bool:
-        if item.heard or item.mismatch:
-            return True
-        if input_named(name).role == Role.FRAMES:
-            return not coming
-        return input_named(name).necessary or name in missing
-
-    return {name: item for name, item in silence.items() if counts(name, item)}
+    coming, kept = any(item.heard for item in _of_frames(silence)), {}
+    for name, item in silence.items():
+        row = input_named(name)
+        awaited = not coming if row.role == Role.FRAMES else row.necessary or name in missing
+        if item.heard or item.mismatch or awaited:
+            kept[name] = item
+    return kept
 
 
 def _of_frames(silence: Mapping[str, Silence]) -> list[Silence]:

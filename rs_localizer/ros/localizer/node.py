@@ -17,9 +17,8 @@ from visualization_msgs.msg import MarkerArray  # type: ignore[import-untyped]
 
 from rs_localizer.config import ImuUse, NodeConfig, PublishTf
 from rs_localizer.core.reasons import Notice
-from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError, stamp_ns
-from rs_localizer.io.outputs import TYPES, Localized, each_message
+from rs_localizer.io.outputs import TYPES, Localized, messages
 from rs_localizer.io.topics import (
     CAMERA_MARKER,
     CORRESPONDENCES,
@@ -45,7 +44,6 @@ from rs_localizer.ros.localizer.health import (
     imu_oddity,
     integrity_message,
     of_interest,
-    readout_values,
     tell,
 )
 from rs_localizer.ros.node.clock import watch_clock
@@ -132,8 +130,9 @@ class Publisher:
         return bool(self._publishers[name].get_subscription_count())
 
     def _send(self, frame: Localized, names: Collection[str]) -> None:
-        """Publish those of these outputs that have subscribers; nothing else is built."""
-        for name, message in each_message(frame, make_message, list(filter(self._wanted, names))):
+        """Publish those of these outputs that have subscribers."""
+        wanted = list(filter(self._wanted, names))
+        for name, message in messages(frame, make_message, wanted).items():
             self._publishers[name].publish(message)
 
 
@@ -318,7 +317,8 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
 
     def _say_map(self, frames: FrameLocalizer) -> None:
         if frames.map is not None:
-            self.get_logger().info(described(frames.map))
+            count, frame = len(frames.map), frames.map.frame
+            self.get_logger().info(f"the map has {count} landmarks in frame {frame!r}")
 
     # -- what it says of itself --------------------------------------------------------------
 
@@ -326,12 +326,15 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         frames = self._frames
         missing = () if frames is None else frames.missing
         oddities = self.refusals.recent(_ODD, WINDOW) | self._broadcaster.fault()
-        values: dict[str, str] = {}
+        values = self._broadcaster.values
         if frames is not None:
             watch, imu = frames.shutter, frames.aid.state
             oddities |= imu_oddity(imu)
             oddities |= {"readout_time": watch.fault} if watch.fault else {}
-            values = readout_values(watch.measured) | (imu.values() if imu else {})
+            values |= imu.values() if imu else {}
+            if (seen := watch.measured) is not None:
+                readout, deviation = 1e3 * seen.readout_time, 1e3 * seen.deviation
+                values["Readout time seen (ms)"] = f"{readout:.2f} +- {deviation:.2f}"
         inputs = {
             name: item for name, item in self.silence.items() if name in inputs_of(self.config)
         }
@@ -341,12 +344,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
             silence=of_interest(inputs, missing),
             oddities=oddities,
             correction=self._broadcaster.decision,
-            values=self._broadcaster.values | values,
+            values=values,
         )
         health = diagnose(condition, self.statistics.summary())
         return health, "" if frames is None else frames.camera_frame
-
-
-def described(landmarks: Map) -> str:
-    """Describe a map in one line."""
-    return f"the map has {len(landmarks)} landmarks in frame {landmarks.frame!r}"

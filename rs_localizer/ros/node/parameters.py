@@ -16,10 +16,9 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.lifecycle import LifecycleNode
 from rclpy.parameter import Parameter
 
-from rs_localizer.config import NodeConfig, type_of
+from rs_localizer.config import NodeConfig, Setting, type_of
 from rs_localizer.settings import (
     Config,
-    Setting,
     as_tuple,
     build,
     camera_settings,

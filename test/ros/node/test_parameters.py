@@ -17,7 +17,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.camera_files import lens_parameters
 from rs_localizer.io.rigs import RigParts, mounted_lenses, node_parameters
 from rs_localizer.ros.node.parameters import SettingsNode
-from rs_localizer.settings import settings, write_camera_file
+from rs_localizer.settings import settings, write_parameters
 
 
 @pytest.fixture
@@ -116,7 +116,7 @@ def test_a_file_of_a_camera_or_of_a_rig_is_a_params_file_too(context, tmp_path, 
     for values, lens in (
         (one, lens_parameters(cameras["a"])), (node_parameters(parts), mounted_lenses(parts))
     ):  # fmt: skip
-        write_camera_file(file, values, lens)
+        write_parameters(file, values, lens)
         made = Recorder(context, *words, "-p", "min_inliers:=11")
         assert made.warnings == []
         configs.append(made.config)

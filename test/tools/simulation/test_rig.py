@@ -11,7 +11,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.rigs import RigParts, mounted_lenses, node_parameters
-from rs_localizer.settings import write_camera_file
+from rs_localizer.settings import write_parameters
 
 K = np.array([[450.0, 0.0, 320.0], [0.0, 450.0, 240.0], [0.0, 0.0, 1.0]])
 TURN = Rotation.from_euler("xyz", [0.1, -0.2, np.pi]).as_matrix()
@@ -27,7 +27,7 @@ def recording(tmp_path_factory):
     }
     poses = {"front": (np.eye(3), np.zeros(3)), "rear": (TURN, PLACE)}
     parts = RigParts(cameras, poses, {"front": 0.0, "rear": -0.25})
-    write_camera_file(folder / "chain.yaml", node_parameters(parts), mounted_lenses(parts))
+    write_parameters(folder / "chain.yaml", node_parameters(parts), mounted_lenses(parts))
     out = folder / "seen"
     still = ("--duration", 1, "--noise", 0, "--outliers", 0)
     turn = ("--angular-velocity", 0.4, 0.8, -0.5)
