@@ -18,8 +18,7 @@ if WORKING:
     from rs_localizer.io.atomic_files import atomic_files
     from rs_localizer.markers.map_files import write_marker_map
     from rs_localizer.markers.maps import MarkerMap, wall
-    from rs_localizer.markers.poses import Pose
-    from rs_localizer.markers.prints import Charuco, Chessboard
+    from rs_localizer.markers.prints import Charuco, Chessboard, Pose
 
 # Six markers, which fill a page. Where more would be smaller than this (m), each has a page of its
 # own: smaller ones are not seen from a few metres.

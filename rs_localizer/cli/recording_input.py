@@ -34,8 +34,7 @@ if WORKING:
     from rs_localizer.io.video import has_times
     from rs_localizer.markers.map_files import read_marker_map
     from rs_localizer.markers.maps import MarkerMap
-    from rs_localizer.markers.poses import Pose
-    from rs_localizer.markers.prints import Chessboard
+    from rs_localizer.markers.prints import Chessboard, Pose
     from rs_localizer.offline.detect import ImageTally, usable
     from rs_localizer.offline.image_sources import (
         Carried,

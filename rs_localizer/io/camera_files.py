@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -112,16 +112,13 @@ def _camera(text: str, chosen: str | None) -> Camera:
         return kalibr_camera(tree)
     if {"fisheye_params", "calib_dimension"} <= set(tree):
         return _gyroflow_camera(tree)
-    if (camera := _named_camera(tree)) is not None:
-        return camera
+    if _first(tree, _K) is not None:
+        return lens_camera(tree)
     found = ", ".join(sorted(map(str, tree))[:8]) or "nothing"
     raise ValueError(f"expected a {CALIBRATION_KINDS}; found {found}")
 
 
-T = TypeVar("T")
-
-
-def _choose(cameras: Mapping[str, T], name: str | None) -> T:
+def _choose(cameras: Mapping[str, Any], name: str | None) -> Any:
     """Return the only camera of a file, or the one that is named."""
     if not cameras:
         raise ValueError("it has no camera")
@@ -157,23 +154,15 @@ def _gyroflow_camera(tree: dict[str, Any]) -> Camera:
     return replace(camera, readout_time=max(readout_time, 0.0))
 
 
-def lens_camera(lens: dict[str, Any]) -> Camera:
-    """Return the camera of :func:`lens_parameters`.
+def lens_camera(tree: dict[str, Any]) -> Camera:
+    """Return the camera of :func:`lens_parameters`, of a file of ROS or OpenCV, or of a user's.
 
     Raises:
         ValueError, KeyError, TypeError: when something is missing or impossible.
     """
-    if (camera := _named_camera(lens)) is None:
-        raise KeyError("camera_matrix")
-    return camera
-
-
-def _named_camera(tree: dict[str, Any]) -> Camera | None:
-    """Return the camera of a file of ROS or OpenCV, or with its usual names; None: no matrix."""
-    K, D = (_first(tree, names) for names in (_K, _D))
+    K, D, size = (_first(tree, names) for names in (_K, _D, _SIZE))
     if K is None:
-        return None
-    size = _first(tree, _SIZE)
+        raise KeyError("camera_matrix")
     if size is None:
         size = [_first(tree, names) for names in (_WIDTH, _HEIGHT)]
         if size == [None, None]:
@@ -237,13 +226,14 @@ def colmap_camera(text: str, chosen: str | None) -> Camera:
     if model not in _COLMAP_MODELS:
         raise ValueError(f"model must be one of {', '.join(_COLMAP_MODELS)}; found {model}")
     names, distortion = _COLMAP_MODELS[model]
-    if len(words) != 2 + len(names.split()):
+    width, height, *numbers = words
+    if len(numbers) != len(names.split()):
         raise ValueError(f"{model} has width, height, {names}; found {' '.join(words)}")
-    values = dict(zip(names.split(), map(float, words[2:]), strict=True))
+    values = dict(zip(names.split(), map(float, numbers), strict=True))
     fx, fy = (values.get(name, values.get("f", 0.0)) for name in ("fx", "fy"))
     D = [values.get(name, 0.0) for name in _ORDER[distortion]]
     K = pinhole_matrix(fx, fy, values["cx"] - _HALF, values["cy"] - _HALF)
-    return Camera(int(words[0]), int(words[1]), K, np.array(D if any(D) else []), distortion)
+    return Camera(int(width), int(height), K, np.array(D if any(D) else []), distortion)
 
 
 def pixel_intrinsics(camera: Camera) -> tuple[Array, Array]:

@@ -24,8 +24,15 @@ import numpy as np
 from rs_localizer.io.reading import dump_yaml, file_faults, load_yaml, read_text
 from rs_localizer.markers.families import FAMILIES, Family, family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
-from rs_localizer.markers.poses import Pose, finite, rotation_of_quaternion
-from rs_localizer.markers.prints import Board, Charuco, Chessboard, Marker
+from rs_localizer.markers.prints import (
+    Board,
+    Charuco,
+    Chessboard,
+    Marker,
+    Pose,
+    finite,
+    rotation_of_quaternion,
+)
 
 USUAL_FAMILY = FAMILIES["apriltag_36h11"]
 """Family of files of other programs that do not say it."""

@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Board, Charuco, Marker, flat_grid
+from rs_localizer.markers.prints import Board, Charuco, Marker, Pose, flat_grid
 
 
 class MarkerMapError(ValueError):

@@ -30,7 +30,6 @@ from rs_localizer.matching.kernels import (
     BestFound,
     Near,
     in_view,
-    move,
     nearest_binary,
     nearest_binary_within,
     nearest_real_within,
@@ -67,14 +66,27 @@ class Visible:
 
 
 class Index:
-    """A search among the descriptors (n,d) that it was made of."""
+    """A search among the descriptors (n,d) that it was made of.
 
-    _rows: NDArray[Any]  # (n,w) as the kernels take them
-    _search_within: Any
+    Bits are compared by how many of them differ, numbers by their Euclidean distance.
+    """
+
+    def __init__(self, descriptors: Descriptors, *, binary: bool) -> None:
+        self._binary = binary
+        self._rows = self._packed(descriptors)  # (n,w) as the kernels take them
+        if binary:
+            self._columns = np.ascontiguousarray(self._rows.T)
+        else:
+            with np.errstate(over="ignore"):
+                self._squares = np.square(self._rows).sum(axis=1)
 
     def nearest(self, queries: Descriptors) -> Nearest:
         """Find the two nearest of all descriptors for queries (q,d)."""
-        raise NotImplementedError
+        result, packed = Nearest.none(len(queries)), self._packed(queries)
+        if not self._binary:
+            return self._nearest_numbers(packed, result)
+        nearest_binary(packed, self._columns, result.distances, result.landmarks)
+        return result
 
     def nearest_within(
         self, queries: Descriptors, pixels: Array, visible: Visible
@@ -84,51 +96,21 @@ class Index:
         owners = np.full(count, -1, np.int64)
         near = Near(pixels, visible.landmarks, visible.pixels, visible.gate)
         best = BestFound(result.distances, result.landmarks, np.full(count, np.inf), owners)
-        self._search_within(self._packed(queries), self._rows, near, best)
+        search = nearest_binary_within if self._binary else nearest_real_within
+        search(self._packed(queries), self._rows, near, best)
         return result, owners
 
-    @staticmethod
-    def _packed(descriptors: Descriptors) -> NDArray[Any]:
-        raise NotImplementedError
-
-
-class _BinaryIndex(Index):
-    """Bits, compared by how many of them differ."""
-
-    _search_within = staticmethod(nearest_binary_within)
-
-    def __init__(self, descriptors: Descriptors) -> None:
-        self._rows = self._packed(descriptors)
-        self._columns = np.ascontiguousarray(self._rows.T)
-
-    def nearest(self, queries: Descriptors) -> Nearest:
-        result = Nearest.none(len(queries))
-        nearest_binary(self._packed(queries), self._columns, result.distances, result.landmarks)
-        return result
-
-    @staticmethod
-    def _packed(descriptors: Descriptors) -> NDArray[Any]:
-        """Pack bytes (n,d) into words (n,w), w a multiple of four; added bytes are zero."""
+    def _packed(self, descriptors: Descriptors) -> NDArray[Any]:
+        """Return numbers as they are, bytes (n,d) as words (n,w), w a multiple of four."""
+        if not self._binary:
+            return np.array(descriptors, np.float32)
         count, width = descriptors.shape
         chunk = _WORD_BYTES * _WORDS_AT_ONCE
         padded = np.zeros((count, -(-width // chunk) * chunk), np.uint8)
         padded[:, :width] = descriptors
         return padded.view(np.uint64)
 
-
-class _RealIndex(Index):
-    """Numbers, compared by their Euclidean distance."""
-
-    _search_within = staticmethod(nearest_real_within)
-
-    def __init__(self, descriptors: Descriptors) -> None:
-        self._rows = self._packed(descriptors)
-        with np.errstate(over="ignore"):
-            self._squares = np.square(self._rows).sum(axis=1)
-
-    def nearest(self, queries: Descriptors) -> Nearest:
-        queries = np.asarray(queries, np.float32)
-        result = Nearest.none(len(queries))
+    def _nearest_numbers(self, queries: NDArray[np.float32], result: Nearest) -> Nearest:
         block = max(1, _MOST_PRODUCTS // len(self._rows))
         # Points that overflow are far away, or nowhere.
         with np.errstate(over="ignore", invalid="ignore"):
@@ -149,15 +131,6 @@ class _RealIndex(Index):
             np.take_along_axis(result.distances, order, 1),
             np.take_along_axis(result.landmarks, order, 1),
         )
-
-    @staticmethod
-    def _packed(descriptors: Descriptors) -> NDArray[Any]:
-        return np.array(descriptors, np.float32)
-
-
-def make_index(descriptors: Descriptors, *, binary: bool) -> Index:
-    """Return the search index of descriptors (n,d), for bits or numbers."""
-    return _BinaryIndex(descriptors) if binary else _RealIndex(descriptors)
 
 
 # Standard deviations of the prediction within which the camera is looked for.
@@ -205,13 +178,12 @@ def _project(camera: Camera, motion: Motion, points: Array) -> Array:
     """Project points (n,3) to raw pixels (n,2), each at the time of its row; NaN behind.
 
     One step of what :func:`rs_localizer.core.shutter.project_rolling` does until no digit changes:
-    to a small part of a pixel, in a fifth of the time.
+    to a small part of a pixel.
     """
-    state, moved = state_in(motion, np.zeros(3)), np.empty(points.shape)
 
     def view(tau: Array) -> Array:
-        move(points, state, tau, moved)
-        return camera.project(moved)
+        rotations, translations = motion.at_rows(tau)
+        return camera.project(np.einsum("nij,nj->ni", rotations, points) + translations)
 
     rows = camera.row_time(view(np.zeros(len(points))))
     error = camera.row_time(view(rows)) - rows
@@ -222,14 +194,11 @@ def _project(camera: Camera, motion: Motion, points: Array) -> Array:
 
 def _bearings(camera: Camera) -> tuple[Array, Array]:
     """Return bounds (2,), (2,) of the bearings in the image; infinite if the lens sees sideways."""
-    width, height = camera.size
-    u = np.linspace(-0.5, width - 0.5, _BORDER_PIXELS)
-    v = np.linspace(-0.5, height - 0.5, _BORDER_PIXELS)
-    border = [
-        *(np.column_stack([u, np.full_like(u, line)]) for line in (v[0], v[-1])),
-        *(np.column_stack([np.full_like(v, column), v]) for column in (u[0], u[-1])),
-    ]
-    rays = camera.rays(np.concatenate(border))
+    u, v = (np.linspace(-0.5, size - 0.5, _BORDER_PIXELS) for size in camera.size)
+    # The lines of a grid's border.
+    columns, rows = np.meshgrid(u, v)
+    rim = (columns == u[0]) | (columns == u[-1]) | (rows == v[0]) | (rows == v[-1])
+    rays = camera.rays(np.column_stack([columns[rim], rows[rim]]))
     if not np.all(np.isfinite(rays)):
         return np.full(2, -np.inf), np.full(2, np.inf)
     return rays.min(axis=0), rays.max(axis=0)
@@ -279,7 +248,7 @@ class Matcher:
         self._index: Index | None = None
         if landmarks.descriptors is not None:
             binary = landmarks.descriptors.dtype == np.uint8
-            self._index = make_index(landmarks.descriptors, binary=binary)
+            self._index = Index(landmarks.descriptors, binary=binary)
 
     def match(
         self, keypoints: Keypoints, camera: Camera | None = None, prior: Prior | None = None
@@ -357,7 +326,7 @@ class Matcher:
             there = np.flatnonzero(firsts >= 0)
             # Descriptors are read as the map's: its bytes are bits, those of keypoints may stand
             # for numbers.
-            index = make_index(queries, binary=self.map.descriptors.dtype == np.uint8)
+            index = Index(queries, binary=self.map.descriptors.dtype == np.uint8)
             back = index.nearest(self.map.descriptors[firsts[there]])
             owners[there] = back.landmarks[:, 0]
         return nearest, owners

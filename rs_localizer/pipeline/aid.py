@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -40,7 +39,9 @@ _BUNDLE = 0.05
 # are without, and now and then a message is lost.
 _MANY, _LONG = 100, 5
 # Share of the last frames below which it is worth a warning that the IMU is not used.
-FEW = 0.5
+_FEW = 0.5
+# rad: accelerometers and maps are upright to a few degrees; a wrong direction is off by 90 or 180.
+_MOST_TILT = math.radians(10.0)
 # Frames whose accelerometer readings average a hand's accelerations out of gravity.
 _SOME = 30
 
@@ -64,7 +65,7 @@ class AidState:
 
     def values(self) -> dict[str, str]:
         """Return values by readable names, without what is not known."""
-        alone = self.mostly if self.share < FEW else None
+        alone = self.mostly if self.share < _FEW else None
         use = "used" if alone is None else f"not used: {alone.detail}"
         values = {"IMU": use, "IMU used (share of the last frames)": f"{self.share:.0%}"}
         if self.gravity is not None:
@@ -85,6 +86,23 @@ class AidState:
             offset, deviation = 1e3 * self.time_offset, 1e3 * status.time_offset_deviation
             values["IMU time offset (ms)"] = f"{offset:.2f} +- {deviation:.2f}"
         return values | {f"IMU not used: {reason}": str(n) for reason, n in self.reasons.items()}
+
+    def oddities(self) -> dict[str, str]:
+        """Return why the camera goes on alone, and what contradicts gyroscope and gravity."""
+        oddities = {}
+        if self.mostly is not None and self.share < _FEW:
+            unused = f"{self.mostly.reason}: {self.mostly.detail}"
+            oddities["imu"] = f"the IMU is not used, {unused}"
+        if self.status is not None and self.status.oddity:
+            said = f"the camera's rotation says of the gyroscope: {self.status.oddity}"
+            oddities["imu.gyroscope"] = said
+        if self.gravity is not None and self.gravity > _MOST_TILT:
+            oddities["imu.gravity"] = (
+                f"the accelerometer shows gravity {math.degrees(self.gravity):.0f} degrees off "
+                "gravity_in_map: is that the direction in which things fall in the map, and does "
+                "TF know the IMU's axes?"
+            )
+        return oddities
 
 
 class Moment(NamedTuple):
@@ -127,6 +145,7 @@ class AidInput:
         self._odd = 0  # frames in a row that say what the gyroscope has
         self._status: InertialStatus | None = None
         self._given_offset = 0.0
+        self._lacking: Unused | None = None  # why the present frame has no samples
 
     def add(self, reading: ImuReading) -> None:
         """Take a reading."""
@@ -181,21 +200,26 @@ class AidInput:
         samples = self._samples(now, start_ns, start_ns, now.time_ns + _AROUND_NS)
         return None if isinstance(samples, Unused) else samples
 
-    def track(
-        self, frame: Moment, localized: Callable[[ImuSamples | None], Estimate | Failure]
-    ) -> Estimate | Failure:
-        """Localize a frame by the tracker, with its samples or with the camera alone."""
+    def readings(self, frame: Moment) -> ImuSamples | None:
+        """Return the samples of a frame; None: the camera goes on alone."""
+        self._lacking = None
+        found = self._samples_of(frame) if self._wanted(frame.config) else None
+        if isinstance(found, Unused):
+            self._lacking, found = found, None
+        return found
+
+    def judge(self, frame: Moment, samples: ImuSamples | None, result: Estimate | Failure) -> None:
+        """Count whether the frame could use its samples, once it is localized."""
         if not self._wanted(frame.config):
-            return localized(None)
-        samples = self._samples_of(frame)
-        if isinstance(samples, Unused):
-            result, unused = localized(None), samples
-        else:
-            result = localized(samples)
-            unused = frame.tracker.aid.status.unused
+            return
+        aid = frame.tracker.aid
+        self._status = None if aid is None else aid.status
+        self._given_offset = frame.config.imu.time_offset
+        unused = self._lacking
+        if samples is not None and self._status is not None:
+            unused = self._status.unused
             self._compare_gravity(frame.config, samples, result)
-        self._count(frame, unused)
-        return result
+        self._count(unused)
 
     def _samples_of(self, frame: Moment) -> ImuSamples | Unused:
         """Return the readings of a frame, or why there are none."""
@@ -243,10 +267,8 @@ class AidInput:
             text = f"from the IMU {self.frame!r} to the camera {at.camera_frame!r}: {error}"
             return Unused(ImuReason.NO_TRANSFORM, text)
 
-    def _count(self, frame: Moment, unused: Unused | None) -> None:
+    def _count(self, unused: Unused | None) -> None:
         self._recently.append(unused)
-        self._status = None if frame.tracker.aid is None else frame.tracker.aid.status
-        self._given_offset = frame.config.imu.time_offset
         oddity = "" if self._status is None else self._status.oddity
         self._odd = self._odd + 1 if oddity else 0
         if self._odd == _LONG:

@@ -174,22 +174,17 @@ class CameraFrames(FrameLocalizer):
         time_ns, context = self._middle_row_ns(cloud.stamp_ns), self._context
         self._expect(time_ns, cloud.frame)
         moment = published_moment(self._config, self._camera, cloud.stamp_ns)
-
-        tracker = self._tracker
-
-        def localized(samples: Any) -> Estimate | Failure:
-            nonlocal moment
-            matches = cloud.points, cloud.pixels, cloud.scores
-            found = tracker.localize(time_ns, *matches, readings=samples, context=context)
-            newest = tracker.newest
-            shown = moment.tau == within_rows(moment.tau) or tracker.repeats
-            if not shown and newest and newest.aided:  # the readings, and no row, show its motion
-                moment = moment._replace(motion=tracker.turned(moment.stamp_ns, samples))
-            return found
-
-        self.aid.track(self._moment(time_ns), localized)
+        tracker, frame = self._tracker, self._moment(time_ns)
+        readings = self.aid.readings(frame)
+        tracker.localize(
+            time_ns, cloud.points, cloud.pixels, cloud.scores, readings=readings, context=context
+        )
         result = tracker.newest
         assert result is not None
+        self.aid.judge(frame, readings, result)
+        shown = moment.tau == within_rows(moment.tau) or tracker.repeats
+        if result and result.aided and not shown:  # the readings, and no row, show its motion
+            moment = moment._replace(motion=tracker.turned(moment.stamp_ns, readings))
         if result:
             self._scale_is_odd = self._stream.pace(
                 time_ns, result, cloud.points, self._config, lambda: self._alone(cloud, result)

@@ -12,10 +12,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import fields, replace
 
 import numpy as np
 
-from rs_localizer.config import NodeConfig
+from rs_localizer.config import Imu, ImuUse, NodeConfig, PublishTf, RefinementKind, RigSettings
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice
@@ -28,7 +29,6 @@ from rs_localizer.io.topics import CAMERA_INFO, MAP_POINTS
 from rs_localizer.io.transforms import Transforms, TransformTree
 from rs_localizer.pipeline.aid import AidInput
 from rs_localizer.pipeline.cloud_checks import oddities
-from rs_localizer.pipeline.in_effect import in_effect, of_estimates
 from rs_localizer.pipeline.keypoint_map import Landmarks, read_landmarks
 from rs_localizer.pipeline.pose_at_time import PublishedMoment, published_motion
 from rs_localizer.pipeline.published import is_mounting_late, of_body
@@ -151,6 +151,17 @@ class FrameLocalizer(ABC):
         """Who says that scan direction or readout time are contradicted."""
         return self._tracker.shutter
 
+    def describe(self) -> tuple[dict[str, str], dict[str, str]]:
+        """Return values for people, and what is odd, by readable names."""
+        state, watch = self.aid.state, self.shutter
+        values, odd = ({}, {}) if state is None else (state.values(), state.oddities())
+        if watch.fault:
+            odd["readout_time"] = watch.fault
+        if (seen := watch.measured) is not None:
+            readout, deviation = 1e3 * seen.readout_time, 1e3 * seen.deviation
+            values["Readout time seen (ms)"] = f"{readout:.2f} +- {deviation:.2f}"
+        return values, odd
+
     def take_zero_for_time(self, recorded_ns: int) -> None:
         """Take a stamp of 0 for a time where a recording has its message at 0, too."""
         self._stream.zero_is_time = recorded_ns == 0
@@ -263,3 +274,35 @@ class FrameLocalizer(ABC):
         for notice, text in odd.items():
             self._notice(notice, f"{name}: {text}" if name else text)
         return thin_cloud(cloud, most, camera.size)
+
+
+# Settings that change what is made of an estimate, or which points come to it, and not how it is
+# made. All others start the track afresh.
+_BESIDE = frozenset({
+    "readout_time_deviation", "pose_time", "max_points", "base_frame",
+    "odom_frame", "publish_tf", "tf_rate", "hold", "two_d_mode",
+    "transform_tolerance", "map_file", "map_frame", "marker_map",
+    "autostart", "output_rate", "camera_file",
+})  # fmt: skip
+
+
+def in_effect(config: NodeConfig) -> NodeConfig:
+    """Return the settings without what ``refinement`` turns off.
+
+    That is what knows more than a frame's points, and TF where no covariance says how good a pose
+    is.
+    """
+    if config.refinement == RefinementKind.FULL:
+        return config
+    config = replace(config, imu=replace(config.imu, use=ImuUse.NONE), tracking=False)
+    if config.refinement == RefinementKind.NONE:
+        config = replace(config, publish_tf=PublishTf.NONE)
+    return config
+
+
+def of_estimates(config: NodeConfig) -> tuple[object, ...]:
+    """Return what estimates depend on: of a rig's window and an IMU, only where there are any."""
+    unused = config.of_cameras or config.imu.use == ImuUse.NONE
+    imu = Imu(use=ImuUse.NONE) if unused else replace(config.imu, wait=0.0)
+    config = replace(config, imu=imu, rig=config.rig if config.of_cameras else RigSettings())
+    return tuple(getattr(config, it.name) for it in fields(config) if it.name not in _BESIDE)

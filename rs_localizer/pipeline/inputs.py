@@ -100,67 +100,38 @@ class Input:
 
 
 # What changes the state comes before the frames: waiting messages are taken in this order.
+# fmt: off
 _ROWS = (
     Input(
-        topics.CAMERA_INFO,
-        CAMERA_INFO_TYPE,
-        "the camera's calibration",
-        Role.STATE,
-        read=read_camera_info,
-        use=lambda localizer, calibration: localizer.calibrate(calibration),
-        refused=Reason.BAD_CAMERA_INFO,
-        in_words="camera_info",
-        necessary=True,
-        latched=True,
+        topics.CAMERA_INFO, CAMERA_INFO_TYPE, "the camera's calibration", Role.STATE,
+        lambda localizer, calibration: localizer.calibrate(calibration), Reason.BAD_CAMERA_INFO,
+        read=read_camera_info, in_words="camera_info", necessary=True, latched=True,
     ),
     Input(
-        topics.MAP_POINTS,
-        CLOUD_TYPE,
-        "the map for keypoints, latched",
-        Role.STATE,
-        read=read_map,
-        use=lambda localizer, landmarks: localizer.use_map(landmarks),
-        refused=Reason.BAD_MAP,
-        in_words="a map",
-        latched=True,
-        lasting=True,
+        topics.MAP_POINTS, CLOUD_TYPE, "the map for keypoints, latched", Role.STATE,
+        lambda localizer, landmarks: localizer.use_map(landmarks), Reason.BAD_MAP,
+        read=read_map, in_words="a map", latched=True, lasting=True,
     ),
     Input(
-        topics.IMU,
-        IMU_TYPE,
-        "the IMU beside the camera",
-        Role.SAMPLES,
-        read=read_imu,
-        use=lambda localizer, reading: localizer.aid.add(reading),
-        refused=Reason.BAD_IMU,
+        topics.IMU, IMU_TYPE, "the IMU beside the camera", Role.SAMPLES,
+        lambda localizer, reading: localizer.aid.add(reading), Reason.BAD_IMU, read=read_imu,
     ),
     Input(
-        topics.CORRESPONDENCES,
-        CLOUD_TYPE,
-        "points of the map and their pixels",
-        Role.FRAMES,
-        use=lambda localizer, message: localizer.localize(message),
-        refused=Reason.BAD_CLOUD,
+        topics.CORRESPONDENCES, CLOUD_TYPE, "points of the map and their pixels", Role.FRAMES,
+        lambda localizer, message: localizer.localize(message), Reason.BAD_CLOUD,
     ),
     Input(
-        topics.KEYPOINTS,
-        CLOUD_TYPE,
-        "pixels with ids or descriptors, to be matched",
-        Role.FRAMES,
-        use=lambda localizer, message: localizer.localize_keypoints(message),
-        refused=Reason.BAD_KEYPOINTS,
+        topics.KEYPOINTS, CLOUD_TYPE, "pixels with ids or descriptors, to be matched", Role.FRAMES,
+        lambda localizer, message: localizer.localize_keypoints(message), Reason.BAD_KEYPOINTS,
         needs=topics.MAP_POINTS,
     ),
     Input(
-        topics.DETECTIONS,
-        APRILTAG_TYPE,
-        "tags of another detector, with marker_map",
-        Role.FRAMES,
-        use=lambda localizer, message: localizer.localize_detections(message),
-        refused=Reason.BAD_DETECTIONS,
+        topics.DETECTIONS, APRILTAG_TYPE, "tags of another detector, with marker_map", Role.FRAMES,
+        lambda localizer, message: localizer.localize_detections(message), Reason.BAD_DETECTIONS,
         also=(ISAAC_TYPE,),
     ),
 )
+# fmt: on
 
 INPUTS = {row.topic: row for row in _ROWS}
 """All inputs by name."""

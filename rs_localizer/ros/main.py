@@ -20,27 +20,15 @@ _ROS_ARGUMENTS, _END_OF_THEM = "--ros-args", "--"  # what is between them is for
 # For each executable, the class of its node or its function below rs_localizer.ros, the name of a
 # node with settings, and a description.
 _PROGRAMS = {
-    "localizer": (
-        "localizer.node.LocalizerNode",
-        "rs_localizer",
-        "Poses and velocities from correspondences or keypoints.",
-    ),
-    "marker_detector": (
-        "detector.markers.MarkerDetectorNode",
-        "marker_detector",
-        "Correspondences from images of markers and boards.",
-    ),
-    "feature_detector": (
-        "detector.features.FeatureDetectorNode",
-        "feature_detector",
-        "Keypoints with descriptors from images.",
-    ),
-    "doctor": (
-        "doctor.run",
-        "",
-        "What a localizer finds on a running robot, and what is wrong; writes its parameters.",
-    ),
-}
+    "localizer": ("localizer.node.LocalizerNode", "rs_localizer",
+                  "Poses and velocities from correspondences or keypoints."),
+    "marker_detector": ("detector.markers.MarkerDetectorNode", "marker_detector",
+                        "Correspondences from images of markers and boards."),
+    "feature_detector": ("detector.features.FeatureDetectorNode", "feature_detector",
+                         "Keypoints with descriptors from images."),
+    "doctor": ("doctor.run", "",
+               "What a localizer finds on a running robot; writes its parameters."),
+}  # fmt: skip
 
 
 class CommandLineError(Exception):

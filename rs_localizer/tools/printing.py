@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from rs_localizer.core.arrays import Array
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Board, Chessboard, Marker
+from rs_localizer.markers.prints import Board, Chessboard, Marker, Pose
 
 # Upright, in mm.
 PAGES = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}

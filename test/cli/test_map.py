@@ -14,7 +14,7 @@ from rs_localizer.io.maps.files import read_map_file, write_npz
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.markers.map_files import read_marker_map, write_marker_map
 from rs_localizer.markers.maps import MarkerMap, wall
-from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.prints import Pose
 
 COLMAP = Path(__file__).parents[1] / "io" / "maps" / "colmap"
 

@@ -15,8 +15,7 @@ from rs_localizer.markers.edges import refine
 from rs_localizer.markers.families import FAMILIES, Family, family
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap, wall
-from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Charuco, Chessboard, Marker
+from rs_localizer.markers.prints import Charuco, Chessboard, Marker, Pose
 
 from .prints import chessboard_cells, look, project, rectangle, render
 

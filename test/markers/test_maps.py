@@ -15,8 +15,7 @@ from rs_localizer.markers.boards import flat_misfit
 from rs_localizer.markers.families import FAMILIES, family
 from rs_localizer.markers.map_files import read_any, read_marker_map, write_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError, wall
-from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Charuco, Chessboard, Marker
+from rs_localizer.markers.prints import Charuco, Chessboard, Marker, Pose
 
 TURN = Rotation.from_euler("xyz", [20.0, -35.0, 110.0], degrees=True)
 IDENTITY = {"position": [0, 0, 0], "quaternion": [0, 0, 0, 1]}

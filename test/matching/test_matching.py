@@ -9,7 +9,7 @@ import pytest
 
 from rs_localizer.io.clouds import Keypoints
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.matching import Matcher, Visible, make_index
+from rs_localizer.matching import Index, Matcher, Visible
 
 
 def make_map(count: int, ids: Any = None, descriptors: Any = None) -> Map:
@@ -39,7 +39,7 @@ def distances(one: Any, other: Any) -> Any:
 @pytest.mark.parametrize("count", [1, 2, 5000])  # more than a block holds
 def test_the_two_nearest_of_all(kind, width, count):
     landmarks, queries = descriptors(kind, count, width, 0), descriptors(kind, 9, width, 1)
-    found = make_index(landmarks, binary=kind == "bits").nearest(queries)
+    found = Index(landmarks, binary=kind == "bits").nearest(queries)
     table = distances(queries, landmarks)
     order = np.argsort(table, axis=1, kind="stable")[:, :2]
     expected = np.take_along_axis(table, order, 1)
@@ -61,9 +61,7 @@ def test_the_two_nearest_within_the_gate(kind):
     rows = rng.permutation(200)[:80]
     order = np.argsort(predicted[:, 1])
     visible = Visible(rows[order], predicted[order], 15.0)
-    found, owners = make_index(landmarks, binary=kind == "bits").nearest_within(
-        queries, pixels, visible
-    )
+    found, owners = Index(landmarks, binary=kind == "bits").nearest_within(queries, pixels, visible)
     table = distances(queries, landmarks[rows])
     table[np.linalg.norm(pixels[:, None] - predicted[None], axis=2) > 15.0] = np.inf
     expected = np.sort(table, axis=1)[:, :2]

@@ -54,7 +54,7 @@ def asked(message: Any, time_ns: int = 5 * SECOND) -> tuple[Any, list[str], Pose
     stamped = make_transform(make_message, 0, "base_link", "camera", MOUNT)
     tree.add(SimpleNamespace(transforms=[stamped]), static=True)
     prior = PosePrior(lambda name, text: notices.append(f"{name}: {text}"))
-    prior.take_pose(read_given_pose(message))
+    prior.given = read_given_pose(message)
     return prior.prior(moment(time_ns, tree), "map"), notices, prior
 
 

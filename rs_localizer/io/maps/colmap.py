@@ -7,8 +7,6 @@ They are read by pycolmap (extra ``mapping``), in a process of its own
 makes a ``.npz`` of a model.
 """
 
-import sqlite3
-from contextlib import closing
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -160,7 +158,6 @@ def _line(values: Array | list[float]) -> str:
 
 
 DATABASE = "database.db"
-_IS_TABLE = "SELECT count(*) FROM sqlite_master WHERE type='table' AND name='descriptors'"
 
 
 def read_colmap(folder: Path, frame: str, database: Path | None = None) -> Map:
@@ -170,37 +167,14 @@ def read_colmap(folder: Path, frame: str, database: Path | None = None) -> Map:
         folder: of the model.
         frame: of the model.
         database: default: ``database.db`` in the folder or in one of the two above it, where
-            COLMAP leaves it, or the only ``.db`` file there that has descriptors; without one the
-            map has no descriptors.
+            COLMAP leaves it; without one the map has no descriptors.
 
     Raises:
         MapError: for anything that is no model.
         ImportError: without pycolmap.
     """
-    database = database or _find_database((folder, *folder.resolve().parents[:2]))
-    model = read_model(folder, database)
+    places = (place / DATABASE for place in (folder, *folder.resolve().parents[:2]))
+    model = read_model(folder, database or next(filter(Path.is_file, places), None))
     usable = model.described
     landmarks = make_map(model.points[usable], model.ids[usable], model.descriptors, frame)
     return replace(landmarks, dropped=landmarks.dropped + int(np.count_nonzero(~usable)))
-
-
-def _find_database(places: tuple[Path, ...]) -> Path | None:
-    for place in places:
-        if (place / DATABASE).is_file():
-            return place / DATABASE
-    for place in places:
-        databases = [path for path in sorted(place.glob("*.db")) if _has_descriptors(path)]
-        if len(databases) > 1:
-            names = ", ".join(path.name for path in databases)
-            raise MapError(f"{place} has several databases of COLMAP, {names}: name one")
-        if databases:
-            return databases[0]
-    return None
-
-
-def _has_descriptors(path: Path) -> bool:
-    try:
-        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as tables:
-            return bool(tables.execute(_IS_TABLE).fetchone()[0])
-    except sqlite3.Error:
-        return False

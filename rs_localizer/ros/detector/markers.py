@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node ``marker_detector``: images in; correspondences with a marker map out."""
 
+import cv2
 import numpy as np
 
 from rs_localizer.config import DetectorConfig
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.topics import CORRESPONDENCES
-from rs_localizer.markers.overlay import draw_detections
 from rs_localizer.pipeline.marker_detector import Detected, FrameDetector, correspondences
 from rs_localizer.ros.detector.image_node import ImageNode, Picture
 from rs_localizer.ros.node.diagnostics import State
@@ -34,9 +34,19 @@ def tell(detected: Detected) -> tuple[int, Told]:
     return detected.image.stamp_ns, Told(State.DETECTING, text, values)
 
 
+# Blue, green, red: of markers that the map has, and of others.
+_KNOWN, _FOREIGN = (230, 120, 0), (0, 150, 255)
+
+
 def draw(detected: Detected) -> Picture:
-    """Return the image with its markers."""
-    return draw_detections(detected.image.pixels, detected.detections)
+    """Return the image (h,w,3) with outlines and numbers of markers; those of the map are blue."""
+    picture = np.asarray(cv2.cvtColor(detected.image.pixels, cv2.COLOR_GRAY2BGR), np.uint8)
+    for item in detected.detections.markers:
+        for own, color in ((item.mapped, _KNOWN), (~item.mapped, _FOREIGN)):
+            quads = list(item.quads[own].astype(np.float32)[:, None])
+            if quads:
+                cv2.aruco.drawDetectedMarkers(picture, quads, item.ids[own, None], color)
+    return picture
 
 
 class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):

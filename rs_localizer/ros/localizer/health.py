@@ -12,7 +12,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.messages import make_header
 from rs_localizer.io.outputs import Localized
-from rs_localizer.pipeline.aid import FEW, AidState
 from rs_localizer.pipeline.camera_frames import DOUBTFUL
 from rs_localizer.pipeline.inputs import Role, input_in_words, input_named
 from rs_localizer.pipeline.map_to_odom import Decision, Standing
@@ -72,30 +71,6 @@ def integrity_message(frame: Localized) -> DiagnosticArray:
     )
     header = make_header(make_message, frame.stamp_ns, frame.map_frame)
     return DiagnosticArray(header=header, status=[status])
-
-
-# Accelerometers and maps are upright to a few degrees; a wrong direction is off by 90 or 180.
-_MOST_TILT = math.radians(10.0)
-
-
-def imu_oddity(state: AidState | None) -> dict[str, str]:
-    """Return reasons why the camera goes on alone, and what contradicts gravity."""
-    if state is None:
-        return {}
-    oddities = {}
-    if state.mostly is not None and state.share < FEW:
-        oddities["imu"] = f"the IMU is not used, {state.mostly.reason}: {state.mostly.detail}"
-    if state.status is not None and state.status.oddity:
-        oddities["imu.gyroscope"] = (
-            f"the camera's rotation says of the gyroscope: {state.status.oddity}"
-        )
-    if state.gravity is not None and state.gravity > _MOST_TILT:
-        oddities["imu.gravity"] = (
-            f"the accelerometer shows gravity {math.degrees(state.gravity):.0f} degrees off "
-            "gravity_in_map: is that the direction in which things fall in the map, and does TF "
-            "know the IMU's axes?"
-        )
-    return oddities
 
 
 # Frames in a row without a pose after which the camera is lost.

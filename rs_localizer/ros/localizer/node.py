@@ -8,29 +8,21 @@ From message to pose: ``Inputs`` takes a message, ``_take_frame`` passes it to t
 
 import functools
 import math
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any
 
+from rclpy.clock import ClockChange, JumpThreshold
+from rclpy.duration import Duration
+from rclpy.node import Node
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray  # type: ignore[import-untyped]
 
 from rs_localizer.config import ImuUse, NodeConfig, PublishTf
 from rs_localizer.core.reasons import Notice
+from rs_localizer.io import topics
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized, messages
-from rs_localizer.io.topics import (
-    CAMERA_MARKER,
-    CORRESPONDENCES,
-    GIVEN_POSES,
-    IMU,
-    INLIERS,
-    INTEGRITY,
-    KEYPOINTS,
-    LIVE,
-    POSE,
-    PRIOR_ODOMETRY,
-)
 from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.given_pose import read_given_pose
@@ -41,12 +33,10 @@ from rs_localizer.ros.localizer.broadcaster import Broadcaster
 from rs_localizer.ros.localizer.health import (
     Condition,
     diagnose,
-    imu_oddity,
     integrity_message,
     of_interest,
     tell,
 )
-from rs_localizer.ros.node.clock import watch_clock
 from rs_localizer.ros.node.conversion import (
     create_output,
     installed,
@@ -62,9 +52,9 @@ from rs_localizer.ros.node.views import MapView, camera_marker
 from rs_localizer.settings import NODE_NAME
 
 # Inputs whose QoS has parameters, as that of ~/pose has.
-_OVERRIDABLE = (CORRESPONDENCES, KEYPOINTS, IMU)
+_OVERRIDABLE = (topics.CORRESPONDENCES, topics.KEYPOINTS, topics.IMU)
 # Outputs that output_rate publishes.
-_MOTION = tuple(name for name in TYPES if name != INLIERS)
+_MOTION = tuple(name for name in TYPES if name != topics.INLIERS)
 # Notices that the diagnostics repeat: frames are localized, and probably not as they should be.
 _ODD = (
     "map_is_camera", "coarse_coordinates", "pixels_outside", "camera_changed", "no_images",
@@ -84,10 +74,12 @@ class Publisher:
 
     def __init__(self, node: Any, frames: FrameLocalizer, broadcaster: Broadcaster) -> None:
         self._node, self._frames, self._broadcaster = node, frames, broadcaster
-        types = TYPES | {name: LIVE[name] for name in (CAMERA_MARKER, INTEGRITY)}
         self._publishers = {
-            name: create_output(node, message_class(kind), f"~/{name}", overridable=name == POSE)
-            for name, kind in types.items()
+            name: create_output(
+                node, message_class(kind), f"~/{name}", overridable=name == topics.POSE
+            )
+            for name, kind in (TYPES | topics.LIVE).items()
+            if name not in (topics.MAP_MARKERS, topics.MAP_TO_ODOM)  # others publish them
         }
         self._map_view = MapView(node)
         self._motion: CameraFrames | None = None  # that of the last frame, for other threads
@@ -99,15 +91,15 @@ class Publisher:
         camera = frames if isinstance(frames, CameraFrames) else None
         ticks = config.output_rate > 0.0 and camera is not None and camera.predicts
         self._motion = camera.snapshot() if camera is not None and ticks else None
-        self._send(frame, [INLIERS] if ticks else TYPES)
+        self._send(frame, [topics.INLIERS] if ticks else TYPES)
         if not ticks or config.publish_tf == PublishTf.MAP_TO_ODOM:
             self._broadcaster.publish(frame)
         self._map_view.show(frame.map_frame, frames.map_points)
-        if camera is not None and self._wanted(CAMERA_MARKER):
+        if camera is not None and self._wanted(topics.CAMERA_MARKER):
             marker = MarkerArray(markers=[camera_marker(frame, camera.view_corners)])
-            self._publishers[CAMERA_MARKER].publish(marker)
-        if math.isfinite(frame.estimate.integrity) and self._wanted(INTEGRITY):
-            self._publishers[INTEGRITY].publish(integrity_message(frame))
+            self._publishers[topics.CAMERA_MARKER].publish(marker)
+        if math.isfinite(frame.estimate.integrity) and self._wanted(topics.INTEGRITY):
+            self._publishers[topics.INTEGRITY].publish(integrity_message(frame))
 
     def publish_motion(self) -> None:
         """Publish pose and twist of now, in the executor's thread, by the last frames' motion."""
@@ -134,6 +126,32 @@ class Publisher:
         wanted = list(filter(self._wanted, names))
         for name, message in messages(frame, make_message, wanted).items():
             self._publishers[name].publish(message)
+
+
+# s: a simulation, or a recording that is played, goes on in shorter steps.
+_LONGEST_STEP = 5.0
+
+
+def watch_clock(node: Node, jumped: Callable[[float], None]) -> Any:
+    """Call this with the seconds of each jump of the node's clock; return the handle.
+
+    A simulated clock jumps where a simulation is reset, or another part of a recording is played;
+    not with each of its steps, and not when it is set for the first time.
+    """
+    clock = node.get_clock()
+
+    def tell(change: Any) -> None:
+        step_ns = change.delta.nanoseconds
+        is_first = clock.now().nanoseconds == step_ns
+        if change.clock_change != ClockChange.ROS_TIME_NO_CHANGE or not is_first:
+            jumped(1e-9 * step_ns)
+
+    jumps = JumpThreshold(
+        min_forward=Duration(seconds=_LONGEST_STEP),
+        min_backward=Duration(nanoseconds=-1),
+        on_clock_change=True,
+    )
+    return clock.create_jump_callback(jumps, post_callback=tell)
 
 
 class LocalizerNode(ManagedNode[NodeConfig, Localized]):
@@ -183,13 +201,13 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
     def begin(self, config: NodeConfig) -> None:
         self.active.callback(self._forget)
         self.active.callback(self._tick_at, 0.0)
-        topics = self.listen(self.topics(config))
+        heard = self.listen(self.topics(config))
         if config.readout_time == 0.0 and not config.of_cameras:
             self.warn(
                 "readout_time is 0 (unknown): no twist is published and frames are not tracked"
             )
         self.get_logger().info(
-            f"active with solver {config.solver}, listening to {' and '.join(topics)}"
+            f"active with solver {config.solver}, listening to {' and '.join(heard)}"
         )
         self._tick_at(config.output_rate)
 
@@ -245,8 +263,9 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
                     overridable=name.rpartition("/")[2] in _OVERRIDABLE,
                     single=item.role is not Role.STATE,
                 )
-        for name, type_name in GIVEN_POSES.items():
-            if not config.of_cameras or name != PRIOR_ODOMETRY:  # frames of a rig have no prior
+        for name, type_name in topics.GIVEN_POSES.items():
+            # Frames of a rig have no prior.
+            if not config.of_cameras or name != topics.PRIOR_ODOMETRY:
                 found[name] = Topic(message_class(type_name), self._take_pose)
         return found
 
@@ -328,13 +347,8 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         oddities = self.refusals.recent(_ODD, WINDOW) | self._broadcaster.fault()
         values = self._broadcaster.values
         if frames is not None:
-            watch, imu = frames.shutter, frames.aid.state
-            oddities |= imu_oddity(imu)
-            oddities |= {"readout_time": watch.fault} if watch.fault else {}
-            values |= imu.values() if imu else {}
-            if (seen := watch.measured) is not None:
-                readout, deviation = 1e3 * seen.readout_time, 1e3 * seen.deviation
-                values["Readout time seen (ms)"] = f"{readout:.2f} +- {deviation:.2f}"
+            said, odd = frames.describe()
+            values, oddities = values | said, oddities | odd
         inputs = {
             name: item for name, item in self.silence.items() if name in inputs_of(self.config)
         }

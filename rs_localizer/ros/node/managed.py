@@ -12,6 +12,7 @@ import gc
 import os
 import sys
 import traceback
+import uuid
 import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Generic, TypeVar
@@ -21,10 +22,11 @@ from lifecycle_msgs.srv import ChangeState
 from rclpy.context import Context
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from rs_localizer.process.stopping import StopRequest, ends_within
-from rs_localizer.ros.node.bond import Bond
+from rs_localizer.ros.node.conversion import message_class, steady_timer
 from rs_localizer.ros.node.diagnostics import Diagnostics, Health
 from rs_localizer.ros.node.parameters import SettingsNode
 from rs_localizer.ros.node.refusals import Refusals, describe
@@ -33,7 +35,55 @@ from rs_localizer.ros.node.subscriptions import Inputs, Silence, Topic
 from rs_localizer.ros.node.worker import Work, Worker, wait_for_workers
 from rs_localizer.settings import Config
 
+_BOND_TYPE, _BOND_TOPIC = "bond/msg/Status", "bond"
+# Period and timeout (s) of nav2's own servers.
+_BEAT, _BEAT_TIMEOUT = 0.1, 4.0
+# Queue depth of bondcpp's publishers.
+_BEAT_DEPTH = 5
+
 Result = TypeVar("Result")
+
+
+class Bond:
+    """The heartbeat by which nav2's lifecycle manager sees that an active node lives.
+
+    The manager expects a status with the node's name on ``bond``, at least once in its
+    ``bond_timeout`` (4 s), and otherwise stops the robot. The messages come from the package
+    ``bond``, which comes with nav2 and is not on PyPI. It beats while somebody listens, until it is
+    closed.
+
+    Args:
+        node: the one that is watched.
+
+    Raises:
+        ImportError: without the package ``bond``.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._status = message_class(_BOND_TYPE)
+        self._node = node
+        self._instance = str(uuid.uuid4())
+        self._publisher = node.create_publisher(self._status, _BOND_TOPIC, _BEAT_DEPTH)
+        self._timer = steady_timer(node, _BEAT, self._beat)
+
+    def _beat(self, *, active: bool = True) -> None:
+        if not (self._node.context.ok() and self._publisher.get_subscription_count()):
+            return
+        status = self._status(
+            id=self._node.get_name(),
+            instance_id=self._instance,
+            active=active,
+            heartbeat_timeout=_BEAT_TIMEOUT,
+            heartbeat_period=_BEAT,
+        )
+        status.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(status)
+
+    def close(self) -> None:
+        """End it as one who leaves: the manager need not wait for the timeout."""
+        self._beat(active=False)
+        self._node.destroy_timer(self._timer)
+        self._node.destroy_publisher(self._publisher)
 
 
 class ManagedNode(SettingsNode[Config], Generic[Config, Result]):

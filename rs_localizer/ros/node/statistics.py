@@ -123,27 +123,27 @@ class Statistics(Generic[Result]):
         # When what happened, with a stamp (topic, ns), a reason, or latency and delay in s.
         self._events: deque[tuple[float, Event, Any]] = deque(maxlen=_MOST_EVENTS)
 
-    def _add(self, event: Event, what: Any = None, count: int = 1) -> None:
-        self._total[event] += count
-        self._events.append((self._clock(), event, what))
+    def count(self, event: Event, what: Any = None, count: int = 1) -> None:
+        """Count what became of frames.
+
+        Args:
+            what: of one that has come its topic and stamp (ns), of a refusal its reason, of an
+                answer its latency and delay (s).
+        """
+        with self._lock:
+            self._total[event] += count
+            self._events.append((self._clock(), event, what))
+            if event in (Event.REFUSED, Event.ANSWERED):
+                self._in_a_row = self._in_a_row + 1 if event is Event.REFUSED else 0
 
     def received(self, topic: str, message: Any) -> None:
         """Count a frame that has come, a message with a header."""
-        with self._lock:
-            self._add(Event.RECEIVED, (topic, stamp_ns(message)))
+        self.count(Event.RECEIVED, (topic, stamp_ns(message)))
 
     def restart(self) -> None:
         """Forget frames before a jump of time: they are not compared with later ones."""
         with self._lock:
             self._events.clear()
-
-    def replaced(self) -> None:
-        with self._lock:
-            self._add(Event.REPLACED)
-
-    def dropped(self, count: int) -> None:
-        with self._lock:
-            self._add(Event.DROPPED, count=count)
 
     def started(self) -> None:
         """Note that the worker has taken a frame."""
@@ -153,19 +153,14 @@ class Statistics(Generic[Result]):
         self._started = None
 
     def refused(self, refusal: Refusal) -> None:
-        with self._lock:
-            self._add(Event.REFUSED, refusal.reason)
-            self._in_a_row += 1
+        self.count(Event.REFUSED, refusal.reason)
         self._refusals.add(refusal.reason, refusal.detail)
 
     def answered(self, result: Result, received: float) -> None:
         """Count a published result of a frame that was received at this time of the clock."""
-        input_stamp_ns, kept = self._tell(result)
+        input_stamp_ns, self._last = self._tell(result)
         delay = (self._ros_time() - input_stamp_ns) * 1e-9
-        with self._lock:
-            self._add(Event.ANSWERED, (self._clock() - received, delay))
-            self._in_a_row = 0
-            self._last = kept
+        self.count(Event.ANSWERED, (self._clock() - received, delay))
 
     def summary(self) -> Summary:
         """Return the state of the frames now."""

@@ -16,7 +16,7 @@ from typing import Any, Generic, TypeVar
 from rs_localizer.core.reasons import Reason
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.node.refusals import describe
-from rs_localizer.ros.node.statistics import Statistics
+from rs_localizer.ros.node.statistics import Event, Statistics
 
 Result = TypeVar("Result")
 Work = Callable[[str, Any], Result | Refusal | Iterator[Result | Refusal] | None]
@@ -98,12 +98,12 @@ class Worker(Generic[Result]):
             self._frames[topic] = _Arrival(topic, message, time.monotonic(), self._session)
             self._changed.notify()
         if replaced:
-            self._statistics.replaced()
+            self._statistics.count(Event.REPLACED)
 
     def pause(self) -> None:
         """Forget the frames so far, the one that is worked on included."""
         with self._publishing, self._changed:
-            self._statistics.dropped(len(self._frames))
+            self._statistics.count(Event.DROPPED, count=len(self._frames))
             self._frames.clear()
             self._session += 1
 
@@ -148,7 +148,7 @@ class Worker(Generic[Result]):
 
     def _begin(self, frame: _Arrival) -> None:
         if not self._is_wanted(frame):
-            self._statistics.dropped(1)
+            self._statistics.count(Event.DROPPED)
             return
         self._statistics.started()
         result = self._attempt(lambda: self._work(frame.topic, frame.message))
@@ -174,7 +174,7 @@ class Worker(Generic[Result]):
             if wanted:
                 failure = self._attempt(lambda: self._publish(result))
         if not wanted:
-            self._statistics.dropped(1)
+            self._statistics.count(Event.DROPPED)
         elif failure is not None:
             self._statistics.refused(failure)
         else:

@@ -10,8 +10,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Marker
+from rs_localizer.markers.prints import Marker, Pose
 from rs_localizer.tools.mapping.gauge import Similarity, upright
 
 _LEAST_FLOOR = 3  # points make a plane

@@ -23,8 +23,7 @@ from scipy.sparse.csgraph import connected_components
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Marker
+from rs_localizer.markers.prints import Marker, Pose
 from rs_localizer.tools.adjust.bodies import BODY, PLACE
 from rs_localizer.tools.adjust.cluster_robust import by_seconds, cluster_robust
 from rs_localizer.tools.adjust.fit import Fit, fit

@@ -27,8 +27,7 @@ from rs_localizer.io.transforms import Transform
 from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.families import LEAST_SIDE, Family
 from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Marker
+from rs_localizer.markers.prints import Marker, Pose
 from rs_localizer.tools.mapping.map_keypoints import middle_row_delay
 
 

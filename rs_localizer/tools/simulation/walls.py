@@ -16,8 +16,7 @@ from rs_localizer.io.video import Image
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap, wall
-from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Marker
+from rs_localizer.markers.prints import Marker, Pose
 
 if TYPE_CHECKING:
     from rs_localizer.tools.simulation.true_motion import TrueState

@@ -8,7 +8,7 @@ from rclpy.clock import ClockType
 from rclpy.parameter import Parameter
 from rclpy.time import Time
 
-from rs_localizer.ros.node.clock import watch_clock
+from rs_localizer.ros.localizer.node import watch_clock
 
 
 def test_a_node_hears_jumps_and_no_steps(peer):

@@ -10,8 +10,7 @@ import pytest
 from rs_localizer.core import so3
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Marker
+from rs_localizer.markers.prints import Marker, Pose
 from rs_localizer.tools.mapping.align import alignment, moved
 
 TURN = so3.exp(np.array([0.4, -0.7, 0.2]))
