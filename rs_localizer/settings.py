@@ -13,7 +13,6 @@ from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from enum import Enum
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
@@ -54,6 +53,7 @@ FIRST = (
 """The settings that everybody sets, first in the help, as in README."""
 Kind = type[NodeConfig] | type[DetectorConfig] | type[FeatureConfig]
 Config = TypeVar("Config", NodeConfig, DetectorConfig, FeatureConfig)
+_cached: dict[Kind, dict[str, Setting]] = {}
 
 
 class SettingsError(ValueError):
@@ -81,11 +81,12 @@ def _cameras(values: Mapping[str, Any]) -> list[str]:
     return [name for name in names if isinstance(name, str) and name]
 
 
-@cache
 def settings(kind: Kind = NodeConfig) -> dict[str, Setting]:
     """Return all settings of a node, by dotted name."""
-    found = dict(_walk(kind(), ""))
-    return {name: found[name] for name in (*FIRST, *found) if name in found}
+    if kind not in _cached:
+        found = dict(_walk(kind(), ""))
+        _cached[kind] = {name: found[name] for name in (*FIRST, *found) if name in found}
+    return _cached[kind]
 
 
 def _walk(config: Any, prefix: str) -> Iterator[tuple[str, Setting]]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.core.camera import Camera, DistortionModel, Roi
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.messages import MessageError, frame_id
 
 
@@ -80,7 +81,10 @@ def read_camera_info(message: Any) -> Calibration:
         )
     model, D = interpret_lens(str(message.distortion_model), D)
     roi = _roi(message.roi, width, height)
-    return Calibration(frame, width, height, K, D, model, binning, roi)
+    found = Calibration(frame, width, height, K, D, model, binning, roi)
+    if K[0] != 0.0 and (binning != (1, 1) or roi is not None):
+        _check_binned(K, (width, height), found)
+    return found
 
 
 # Other names of the models, in drivers and in files.
@@ -121,6 +125,27 @@ def interpret_lens(said: str, D: tuple[float, ...]) -> tuple[str, tuple[float, .
     counts = DistortionModel(name).law.counts
     fitting = [count for count in counts if used <= count < len(D)]
     return name, D if len(D) in counts or not fitting else D[: max(fitting)]
+
+
+# Principal points lie so near the middle, as a share of the image.
+_CENTRAL = 0.2
+
+
+def _check_binned(K: tuple[float, ...], size: tuple[int, int], image: Calibration) -> None:
+    """Refuse a K of the delivered image beside a binning or a region, which would count twice."""
+    camera = image.camera(0.0, ScanDirection.TOP_TO_BOTTOM)
+    centre = np.array([K[2], K[5]])
+
+    def central(extent: tuple[int, int]) -> bool:
+        return bool(np.all(np.abs(centre - 0.5 * np.array(extent)) < _CENTRAL * np.array(extent)))
+
+    if camera.size != size and central(camera.size) and not central(size):
+        raise MessageError(
+            f"K is of the delivered image of {camera.size[0]}x{camera.size[1]}: its principal "
+            f"point ({K[2]:g}, {K[5]:g}) lies in the middle of that, not of the {size[0]}x{size[1]}"
+            " of the message; give width and height of that image without binning and region, or a "
+            "K of all pixels"
+        )
 
 
 def _roi(roi: Any, width: int, height: int) -> Roi | None:

@@ -21,9 +21,7 @@ from rs_localizer.io.messages import Make, MessageError, frame_id, make_header, 
 
 # sensor_msgs/PointField: the number of a type and its NumPy code.
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_NAMES = dict(
-    zip(_FORMATS, "INT8 UINT8 INT16 UINT16 INT32 UINT32 FLOAT32 FLOAT64".split(), strict=True)
-)
+_NAMES = {number: np.dtype(code).name.upper() for number, code in _FORMATS.items()}
 _NUMBERS = {np.dtype(code): number for number, code in _FORMATS.items()}
 # Types that each known field may have; a name means the same in every cloud.
 _TYPES = dict.fromkeys(("x", "y", "z", "u", "v", "score"), (7, 8)) | {
@@ -67,14 +65,10 @@ def read_correspondences(message: Any) -> Correspondences:
     """
     frame = frame_id(message, "the frame of x, y, z")
     rows = _read_rows(message, ("x", "y", "z", "u", "v"), ("score", "id"))
+    points, pixels = rows.columns("x", "y", "z"), rows.columns("u", "v")
+    scores = rows.values.get("score")
     return Correspondences(
-        stamp_ns=stamp_ns(message),
-        frame=frame,
-        points=rows.columns("x", "y", "z"),
-        pixels=rows.columns("u", "v"),
-        scores=rows.values.get("score"),
-        dropped=rows.dropped,
-        table=rows.table,
+        stamp_ns(message), frame, points, pixels, scores, rows.dropped, rows.table
     )
 
 
@@ -303,15 +297,8 @@ def read_keypoints(message: Any) -> Keypoints:
         MessageError: for anything that cannot be read, saying what was found.
     """
     rows = _read_rows(message, ("u", "v"), ("id", "descriptor", "score"))
-    ids, descriptors = _marks(rows, message)
-    return Keypoints(
-        stamp_ns=stamp_ns(message),
-        pixels=rows.columns("u", "v"),
-        ids=ids,
-        descriptors=descriptors,
-        scores=rows.values.get("score"),
-        dropped=rows.dropped,
-    )
+    marks, scores = _marks(rows, message), rows.values.get("score")
+    return Keypoints(stamp_ns(message), rows.columns("u", "v"), *marks, scores, rows.dropped)
 
 
 def read_map(message: Any) -> Map:
@@ -323,9 +310,8 @@ def read_map(message: Any) -> Map:
     """
     frame = frame_id(message, "the frame of x, y, z")
     rows = _read_rows(message, ("x", "y", "z"), ("id", "descriptor"))
-    ids, descriptors = _marks(rows, message)
     try:
-        landmarks = make_map(rows.columns("x", "y", "z"), ids, descriptors, frame)
+        landmarks = make_map(rows.columns("x", "y", "z"), *_marks(rows, message), frame)
         return replace(landmarks, dropped=rows.dropped)
     except MapError as error:
         raise MessageError(str(error)) from error

@@ -155,8 +155,8 @@ def decode_image(packed: bytes, format_: str) -> Gray:
             f"and its {len(data)} bytes start with {start.hex(' ') or 'nothing'}"
         )
     name, _, end = formats[0]
-    # OpenCV fills what is missing with gray and says nothing.
-    if not _ends_with(data, end):
+    # OpenCV fills what is missing with gray and says nothing. Zeros may follow, of whole buffers.
+    if not packed.rstrip(b"\0").endswith(end):
         raise MessageError(f"the {name} image is truncated: its {len(data)} bytes have no end mark")
     size = _claimed_size(packed, name)
     if size is None:
@@ -209,13 +209,6 @@ def _still_png(data: bytes) -> bytes:
     if position > len(data) or kind != b"IEND":
         raise MessageError(f"the PNG image of {len(data)} bytes has a chunk that is longer than it")
     return b"".join(chunks)
-
-
-def _ends_with(data: Gray, mark: bytes) -> bool:
-    """Return True if the mark is at the end; zeros may follow, of whole buffers."""
-    last = np.flatnonzero(data)
-    end = int(last[-1]) + 1 if len(last) else 0
-    return data[max(0, end - len(mark)) : end].tobytes() == mark
 
 
 def _eight_bits(image: NDArray[Any]) -> Gray:

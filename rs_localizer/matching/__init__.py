@@ -357,14 +357,9 @@ def correspondences(matches: Matches, keypoints: Keypoints, landmarks: Map) -> C
         columns.append(matches.scores)
     with np.errstate(over="ignore"):  # pixels of 1e300 are no pixels in single precision either
         table = make_rows(kinds, columns)
+    stamp_ns, dropped = keypoints.stamp_ns, keypoints.dropped
     return Correspondences(
-        stamp_ns=keypoints.stamp_ns,
-        frame=landmarks.frame,
-        points=points,
-        pixels=pixels,
-        scores=matches.scores,
-        dropped=keypoints.dropped,
-        table=table,
+        stamp_ns, landmarks.frame, points, pixels, matches.scores, dropped, table
     )
 
 

@@ -166,7 +166,9 @@ def joined(names: Sequence[str], images: Sequence[CameraImage]) -> Correspondenc
     clouds = [image.cloud for image in images]
     tables = [cloud.table for cloud in clouds]
     fields = [
-        name for name in tables[0].dtype.names or () if all(name in it.dtype.names for it in tables)
+        name
+        for name in tables[0].dtype.names or ()
+        if all(name in (it.dtype.names or ()) for it in tables)
     ]
     columns = [np.concatenate([table[name] for table in tables]) for name in fields]
     kinds = [(name, of.dtype.newbyteorder("<")) for name, of in zip(fields, columns, strict=True)]

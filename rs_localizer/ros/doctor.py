@@ -8,7 +8,7 @@ transforms. It prints what the node finds.
 
 import sys
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -181,13 +181,6 @@ def answer(health: Health) -> str:
     return "; ".join(words)
 
 
-def launch_words(inputs: Mapping[str, list[str]]) -> str:
-    """Return the command that starts a localizer on these topics."""
-    words = [f"{name}:={found[0]}" for name, found in inputs.items()]
-    words.append(f"params_file:={FILE}")
-    return " ".join(["ros2 launch rs_localizer localizer.launch.py", *words])
-
-
 def run(stop: StopRequest, args: list[str] | None = None) -> int:
     """Look around, print and write; return 0 if a localizer works with what was found."""
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
@@ -218,5 +211,9 @@ def run(stop: StopRequest, args: list[str] | None = None) -> int:
     node.write(FILE)
     node.destroy_node()
     rclpy.try_shutdown()
-    sys.stdout.write("\n".join([*lines[:-1], launch_words(around.inputs), lines[-1]]) + "\n")
+    words = [f"{name}:={found[0]}" for name, found in around.inputs.items()]
+    command = " ".join(
+        ["ros2 launch rs_localizer localizer.launch.py", *words, f"params_file:={FILE}"]
+    )
+    sys.stdout.write("\n".join([*lines[:-1], command, lines[-1]]) + "\n")
     return 0 if well else 1

@@ -151,7 +151,7 @@ def test_covariances_of_no_map(tmp_path, value):
     covariances = np.tile(np.eye(3), (2, 1, 1))
     covariances[1, 2, 2] = value
     np.savez(tmp_path / "map.npz", points=np.ones((2, 3)), ids=[1, 2], covariances=covariances)
-    with pytest.raises(MapError, match=r"finite variances of 0 or more .* at index 1"):
+    with pytest.raises(MapError, match="finite variances of 0 or more"):
         read_map_file(tmp_path / "map.npz", "map")
 
 

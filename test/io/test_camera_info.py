@@ -86,3 +86,22 @@ def test_where_two_lenses_can_be_meant(make_camera_info):
     message = make_camera_info(distortion_model="", d=np.array(EIGHT[:4]))
     with pytest.raises(MessageError, match="4 coefficients may be of plumb_bob or of equidistant"):
         read_camera_info(message)
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"binning_x": 2, "binning_y": 2},
+        {"roi": roi(0, 0, 640, 480)},
+        {"roi": roi(640, 480, 640, 480)},
+    ],
+)
+def test_a_K_of_the_delivered_image_is_named(make_camera_info, told):
+    """Of a sensor of 1280x960; its binning, or its region, would count twice."""
+    sensor = {"width": 1280, "height": 960} | told
+    with pytest.raises(
+        MessageError, match=r"K is of the delivered image of 640x480: its principal"
+    ):
+        read_camera_info(make_camera_info(**sensor))
+    K = np.array([1000.0, 0.0, 639.5, 0.0, 1020.0, 479.5, 0.0, 0.0, 1.0])
+    assert tuple(K) == read_camera_info(make_camera_info(k=K, **sensor)).K

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rs_localizer.io.maps.colmap import read_colmap
 from rs_localizer.io.maps.landmarks import Map, MapError, make_map
@@ -35,7 +34,7 @@ _DAMAGES = (
 )  # fmt: skip
 
 
-def _arrays(file: IO[bytes]) -> dict[str, NDArray[Any]]:
+def _arrays(file: IO[bytes]) -> dict[str, Any]:
     try:
         with zipfile.ZipFile(file) as archive:
             sizes = np.array([(it.compress_size, it.file_size) for it in archive.infolist()])
@@ -85,7 +84,7 @@ def read_map_file(path: Path | str, frame: str, database: Path | None = None) ->
             raise MapError("it is not a folder of COLMAP, which alone has a database")
         with file.open("rb") as opened, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # NumPy warns of old headers
-            arrays = _arrays(opened)
-        return make_map(frame=frame, **dict.fromkeys(_ARRAYS) | arrays)
+            arrays = {"ids": None, "descriptors": None} | _arrays(opened)
+        return make_map(frame=frame, **arrays)
     except MapError as error:
         raise MapError(f"{path}: {error}") from error

@@ -122,7 +122,7 @@ class ImageNode(ManagedNode[Settings, Result], Generic[Settings, Result]):
         if not self._listening:
             message = f"no subscription to the {self.output} or the debug image"
             return Health(Level.OK, State.IDLE, message)
-        causes = [f"{it.topic}: {it.cause}" for it in self.silence.values() if it.cause]
+        causes: list[str] = [f"{it.topic}: {it.cause}" for it in self.silence.values() if it.cause]
         if causes:
             message = "; ".join([f"{State.WAITING} images", *causes])
             return Health(Level.WARN, State.WAITING, message, subject="images")
