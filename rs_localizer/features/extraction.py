@@ -242,8 +242,10 @@ class FeatureExtractor:
                 detected, descriptors = self._detector.detectAndCompute(image, None)
             else:
                 detected = self._detector.detect(image)
-            rows = self._choose(detected, image)
-            detected = [detected[row] for row in rows]
+            scores = np.array([keypoint.response for keypoint in detected])
+            size = image.shape[1], image.shape[0]
+            rows = choose_balanced(_points(detected), scores, size, self._most)
+            detected = [detected[row] for row in rows.tolist()]
             if not self._method.at_once:
                 # Some keypoints are too near the rim and are dropped, and others change their
                 # places.
@@ -258,14 +260,6 @@ class FeatureExtractor:
             _single(np.array([keypoint.size for keypoint in detected])),
             _root(descriptors) if self._is_sift else np.ascontiguousarray(descriptors, np.uint8),
         )
-
-    def _choose(self, detected: Sequence[Any], image: Gray) -> list[int]:
-        scores = np.array([keypoint.response for keypoint in detected])
-        height, width = image.shape
-        rows: list[int] = choose_balanced(
-            _points(detected), scores, (width, height), self._most
-        ).tolist()
-        return rows
 
 
 def _single(values: Array) -> Array:

@@ -89,7 +89,7 @@ class BagReader:
         """Return a topic of one of these types: the given one, or the only one.
 
         Args:
-            option: that gives one, as ``-r imu:=TOPIC``.
+            option: that gives one, as ``-r NAME:=TOPIC``.
             name: topics that end in it are preferred.
 
         Raises:

@@ -136,11 +136,6 @@ class UnusableTransforms:
         self._faults.pop(names, None)
         return link
 
-    def of(self, frame: str) -> str:
-        """Say what is wrong with a transform of this frame; an empty text if none was wrong."""
-        faults = (fault for names, fault in list(self._faults.items()) if frame in names)
-        return next(faults, "")
-
     def explain(self, text: str) -> str:
         """Return a sentence on frames without a transform, with the last of the faults."""
         faults = [fault for fault in list(self._faults.values()) if fault not in text]
@@ -237,9 +232,8 @@ class TransformTree:
         for name in names:
             if name not in self._tracks and name not in self._parents:
                 frames = ", ".join(sorted(self._parents | set(self._tracks))) or "none"
-                if fault := self._unusable.of(name):
-                    raise TransformError(f"frame {name!r} has no usable transform: {fault}")
-                raise TransformError(f"frame {name!r} does not exist; there are {frames}")
+                text = f"frame {name!r} does not exist; there are {frames}"
+                raise TransformError(self._unusable.explain(text))
 
     def _above(
         self, name: str, stamp_ns: int | None

@@ -48,9 +48,7 @@ class Video:
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
-        self.lasts = self.until = (
-            0.0  # s, by the header (0: it does not say), and of the last image
-        )
+        self.lasts = self.until = 0.0  # s, by the header (0: unknown), and of the last image
         self.damaged = 0  # packets that could not be decoded
         self.captured: float | None = None  # images/s by the note of a phone; None: there is none
         if not self.path.is_file():

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -53,9 +54,11 @@ class CameraFrames(FrameLocalizer):
         """Use ``camera_file``, ``map_file`` and ``marker_map`` of the settings, if any."""
         super().load_files()
         if self.config.marker_map:  # others need no detector
-            from rs_localizer.pipeline.tags import read_tags
+            from rs_localizer.markers.map_files import read_marker_map
+            from rs_localizer.pipeline.tags import Tags
 
-            self._tags = read_tags(self.config.marker_map, self._notice)
+            marker_map = read_marker_map(Path(self.config.marker_map).expanduser())
+            self._tags = Tags(marker_map, self._notice)
 
     @property
     def map_points(self) -> Array | None:

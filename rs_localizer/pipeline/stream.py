@@ -64,18 +64,16 @@ class Stream:
             return refusal
         last_ns, last_frame = self._last or (stamp_ns, frame)
         late = (last_ns - stamp_ns) * 1e-9
+        before = f"the stamp {stamp_ns * 1e-9:.3f} s lies {late:.3f} s before the last one"
         if self._last is not None and frame == last_frame and 0.0 <= late < _LATE:
             if late == 0.0:
                 text = f"a frame with the stamp {stamp_ns * 1e-9:.6f} s has come already"
                 return Refusal(Reason.REPEATED_STAMP, text)
-            text = f"the stamp {stamp_ns * 1e-9:.3f} s lies {late:.3f} s before the last one"
-            return Refusal(Reason.LATE_FRAME, text)
+            return Refusal(Reason.LATE_FRAME, before)
         self._last = stamp_ns, frame
         notices: dict[Notice, str] = {}
         if late > 0.0:
-            notices[Notice.TIME_WENT_BACK] = (
-                f"the stamp {stamp_ns * 1e-9:.3f} s lies {late:.3f} s before the last one"
-            )
+            notices[Notice.TIME_WENT_BACK] = before
         if frame != last_frame:
             notices[Notice.MAP_CHANGED] = (
                 f"the points are in frame {frame!r}, the last ones were in {last_frame!r}"

@@ -3,7 +3,6 @@
 """Tags that other detectors have found become correspondences by a map of markers."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.io.clouds import Correspondences, make_rows, point_fields
 from rs_localizer.io.detections import read_detections
-from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse
 
@@ -72,15 +70,6 @@ class Tags:
                 self._notice(name, f"the detector has found {found}, {text}")
         rows[repeated] = -1
         return rows
-
-
-def read_tags(file: str, notice: Notify) -> Tags:
-    """Read the tags of a map file; ``~`` is the user's home.
-
-    Raises:
-        MarkerMapError: for a file that cannot be used.
-    """
-    return Tags(read_marker_map(Path(file).expanduser()), notice)
 
 
 def listed(names: Sequence[str]) -> str:

@@ -123,10 +123,10 @@ def test_loops_end():
 @pytest.mark.parametrize(
     ("wrong", "text"),
     [
-        (tf("a", "b", (NAN, 0.0, 0.0), NO_TURN), r"usable .*'b' in 'a' on TF the tr.*not finite"),
-        (tf("a", "/b", (0.0, 0.0, 0.0), (0.0,) * 4), r"usable .* the quat.* is not a rotation"),
-        (tf("a", "b", (0.0, 0.0, 0.0), (NAN,) * 4), r"usable .* \(nan, nan, .* is not a rotation"),
-        (tf("a", "b", (0.0, 0.0, 0.0), (0.0, 0.0, 0.1, 1.1)), "usable .* is not a rotation"),
+        (tf("a", "b", (NAN, 0.0, 0.0), NO_TURN), r"not exist.*'b' in 'a' on TF the tr.*not finite"),
+        (tf("a", "/b", (0.0, 0.0, 0.0), (0.0,) * 4), r"not exist.* the quat.* is not a rotation"),
+        (tf("a", "b", (0.0, 0.0, 0.0), (NAN,) * 4), r"not exist.* \(nan, nan, .* is not a rot"),
+        (tf("a", "b", (0.0, 0.0, 0.0), (0.0, 0.0, 0.1, 1.1)), "not exist.* is not a rotation"),
         (tf("", "b", (0.0, 0.0, 0.0), NO_TURN), "does not exist; there are none"),
         (tf("b", "/b", (0.0, 0.0, 0.0), NO_TURN), "does not exist; there are none"),
     ],

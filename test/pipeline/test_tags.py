@@ -97,7 +97,7 @@ def test_pixels_and_corners_are_those_of_our_own_detector(walls: Path) -> None:
     for message, (_, image) in zip(of_apriltag(walls), images(walls), strict=True):
         found = read_detections(message)
         (seen,) = (item for item in ours.detect(image).markers if "36h11" in item.family.name)
-        known = dict(zip(found.ids.tolist(), found.corners, strict=True))
+        known = {number: own for (_, number), own in zip(found.names, found.corners, strict=True)}
         for number, quad, exact in zip(seen.ids.tolist(), seen.quads, seen.exact, strict=True):
             if number in known and exact.all():
                 offsets.append(known[number] - quad)

@@ -195,8 +195,7 @@ class Inputs:
     def _settle(self, name: str, profile: QoSProfile) -> SetParametersResult:
         """Fill in, after the user's overrides, what the publishers offer now."""
         self._wished[name] = policies(profile)
-        topic = self._node.resolve_topic_name(name)
-        found = self._node.get_publishers_info_by_topic(topic)
+        found = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(name))
         offers = [policies(each.qos_profile) for each in found]
         profile.reliability, profile.durability = best(self._wished[name], offers)
         return SetParametersResult(successful=True)
