@@ -47,16 +47,12 @@ def test_coarse_coordinates_and_pixels_of_another_resolution_are_told(odd, told,
 
 def test_landmarks_that_are_gone_are_named():
     both, none = np.ones(2, np.bool_), np.zeros(2, np.bool_)
-
-    def said(seen: Correspondences, gone: np.ndarray, names: tuple[str, ...] = ()) -> str:
-        return stale_landmarks(seen, gone, None, CAMERA, names)  # no marker is asked for its place
-
-    assert said(cloud(), none) == ""
-    assert said(cloud(), both).endswith(": (0.00, 1.00, 2.00), (1.00, -5.00, 3.00)")
+    assert stale_landmarks(cloud(), none) == ""
+    assert stale_landmarks(cloud(), both).endswith(": (0.00, 1.00, 2.00), (1.00, -5.00, 3.00)")
     table = np.zeros(40, [("id", "<u4")])
     table["id"] = np.arange(40) // 4  # corners of markers
     seen = Correspondences(0, "map", np.zeros((40, 3)), np.zeros((40, 2)), None, 0, table)
-    assert said(seen, table["id"] > 7).endswith("matched: 8, 9")
-    assert said(seen, table["id"] > 7, tuple("abcdefghij")).endswith("matched: i, j")
+    assert stale_landmarks(seen, table["id"] > 7).endswith("matched: 8, 9")
+    assert stale_landmarks(seen, table["id"] > 7, "abcdefghij").endswith("matched: i, j")
     seen.table["id"] = 2 * np.arange(40)
-    assert said(seen, np.ones(40, np.bool_)).endswith(" 20, 22 ...")
+    assert stale_landmarks(seen, np.ones(40, np.bool_)).endswith(" 20, 22 ...")
