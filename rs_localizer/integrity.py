@@ -21,13 +21,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import Acceleration
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, Array2, BoolArray
-from rs_localizer.core.state import POSE, TURN
+from rs_localizer.core.state import POSE
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.moved_part import likeness
+from rs_localizer.estimation.moved_part import keys_of, likeness
 from rs_localizer.estimation.prior import Prior
-from rs_localizer.estimation.window import acceleration_covariance
+from rs_localizer.estimation.window import acceleration_covariance, step_from
 from rs_localizer.native import entry
 
 NAMES = "apart", "spread", "count", "innovation"
@@ -50,8 +49,6 @@ JUMP, MOST_JUMP = (-15.57, 5.34), 0.65
 INNOVATION = NAMES.index("innovation")
 # Neighbours of a point in the map that are compared with it; most points that are compared.
 _NEIGHBOURS, _MOST = 4, 200
-# Weights that make one number of a landmark's position, which no other position shares.
-_KEY = np.sqrt([2.0, 3.0, 5.0])
 # A landmark has disappeared if an existing one would be missed as often with less than this
 # probability. Most landmarks that are remembered.
 _BY_CHANCE, _MOST_LANDMARKS = 1e-8, 20_000
@@ -61,15 +58,13 @@ _MOST_ODDS = 8.0
 
 def _together(points: Array, kept: BoolArray) -> float:
     """Return how far inliers and outliers cluster in the map, in deviations of chance."""
-    if len(points) > _MOST:
-        chosen = np.linspace(0, len(points) - 1, _MOST).astype(int)
-        points, kept = points[chosen], kept[chosen]
+    chosen = np.linspace(0, len(points) - 1, min(len(points), _MOST)).astype(int)
+    points, kept = points[chosen], kept[chosen]
     count, share = len(points), float(np.mean(kept)) if len(points) else 1.0
     if count <= 2 * _NEIGHBOURS or not 0.0 < share < 1.0:
         return 0.0
-    alike = likeness(points, kept.astype(np.float64) - share, _NEIGHBOURS) / (
-        share * (1.0 - share)
-    )  # Moran's I
+    alike = likeness(points, kept.astype(np.float64) - share, _NEIGHBOURS)
+    alike /= share * (1.0 - share)  # Moran's I
     expected, deviation = -1.0 / (count - 1.0), math.sqrt(1.5 / (count * _NEIGHBOURS))
     return min(max((alike - expected) / deviation, -3.0), 15.0)
 
@@ -101,18 +96,8 @@ def _innovation(estimate: Estimate, prior: Prior, added: Array) -> float:
     spread = np.asarray(prior.covariance)[:6, :6] + estimate.covariance[:6, :6] + added
     if not np.isfinite(spread).all():
         return 0.0
-    turn = so3.log(np.ascontiguousarray(prior.motion.rotation @ estimate.rotation.T))
-    centre = -prior.motion.rotation.T @ prior.motion.translation
-    off = np.zeros(6)
-    off[TURN] = turn
-    off[3:] = prior.motion.rotation @ (estimate.position - centre)
+    off = step_from(prior.motion, estimate)[POSE]
     return min(math.log1p(float(off @ np.linalg.solve(spread, off)) / 6.0), 6.0)
-
-
-def _keys(points: Array) -> Array:
-    """Return a key (n,) of each landmark, made of its place (n,3) in the map."""
-    keys: Array = (points * _KEY).sum(axis=1)
-    return keys
 
 
 class SeenLandmarks:
@@ -166,7 +151,7 @@ class Integrity:
 
     def stale(self, points: ArrayLike) -> BoolArray:
         """Return which landmarks (n,3) were seen too often to be unmatched by chance."""
-        return self._seen.stale(_keys(np.asarray(points, float)))
+        return self._seen.stale(keys_of(np.asarray(points, float)))
 
     def numbers(
         self, estimate: Estimate, points: ArrayLike, prior: Prior | None, seconds: float
@@ -185,17 +170,12 @@ class Integrity:
             innovation = _innovation(estimate, prior, added[POSE, POSE])
         usable = np.isfinite(np.asarray(estimate.residuals))
         every, kept = np.asarray(points, float)[usable], np.asarray(estimate.inliers)[usable]
-        self._seen.add(_keys(every), kept)
+        self._seen.add(keys_of(every), kept)
         inliers = int(kept.sum())
         outliers = (len(kept) - inliers + 1.0) / (len(kept) + 2.0)
-        return np.array(
-            [
-                _together(every, kept) * outliers,  # less, if few cluster: a person in view
-                _spread(every[kept], every),
-                math.log(max(inliers - 6.0, 1.0)),
-                innovation,
-            ]
-        )
+        clusters = _together(every, kept) * outliers  # less, if few cluster: a person in view
+        few = math.log(max(inliers - 6.0, 1.0))
+        return np.array([clusters, _spread(every[kept], every), few, innovation])
 
     def add(self, numbers: Array, seconds: float) -> float:
         """Return the probability that the pose is wrong, after a frame with these numbers (4,).

@@ -8,19 +8,19 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig, RefinementKind, localizer_config
 from rs_localizer.core.arrays import Array, instance, real
-from rs_localizer.core.bearings import seen_at
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Rig, RigEstimate
 from rs_localizer.core.rotation_prior import RotationPrior
-from rs_localizer.core.state import PARAMETERS, POSE, VELOCITIES, rotation_of, step_between
+from rs_localizer.core.shake import shake_at
+from rs_localizer.core.state import PARAMETERS, POSE, VELOCITIES, step_between
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.acceptance import (
     estimate_of,
@@ -40,7 +40,7 @@ from rs_localizer.estimation.calibration import (
 from rs_localizer.estimation.hypotheses import Posterior, frame_posterior
 from rs_localizer.estimation.known_rotation import coupled_turn
 from rs_localizer.estimation.left_out import LeftOut, by_chance, left_out, reordered
-from rs_localizer.estimation.moved_part import MovedParts, look_at, neighbours_alike
+from rs_localizer.estimation.moved_part import MovedParts
 from rs_localizer.estimation.points import (
     NEAREST,
     Observed,
@@ -60,6 +60,7 @@ from rs_localizer.estimation.prior import (
     unchecked,
     with_motion,
 )
+from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.robust import GATE, WIDEST_GATE, best_motion
 from rs_localizer.estimation.search import Candidate, MotionSearch, generator
 from rs_localizer.solvers.table import find_solver, start_solver
@@ -72,10 +73,6 @@ _MAP_GATE = 2.45
 # rad/s, twice the range of most sensors (2000 deg/s).
 _FASTEST_RATE = 70.0
 _UNRANKED = np.zeros(0, np.int64)
-# A point is exposed at the time of its row, which depends on where it is seen. Each iteration
-# divides the error of that time by some hundred: by the inverse share of the image that a readout
-# moves it.
-_LOOKS = 2
 # Least share of inliers near a prediction, over the share that agreed before.
 _STILL_TRACKED = 0.7
 # If noise fills a gate, it is widened up to this many times, by at least this factor at a time.
@@ -84,21 +81,6 @@ _WIDEST, _LEAST_WIDER = 4.0, 1.25
 _ROUGHEST = 0.04
 # Noise is half-normal, of this part of the gate: users leave room for errors of 3.5 deviations.
 _NOISE = 0.25
-
-
-class _Inputs(NamedTuple):
-    """The checked arguments of :meth:`Localizer.find`."""
-
-    exposure: Exposure
-    counts: Sequence[int]  # points of each camera, one after the other
-    points: Array
-    pixels: Array
-    scores: Array | None
-    prior: Prior | None
-    expected_share: float
-    rotation: RotationPrior | None
-    error_modes: LandmarkErrors | None
-    parts: MovedParts | None
 
 
 class Localizer:
@@ -232,19 +214,27 @@ class Localizer:
         if prior is not None:
             instance("prior", prior, Prior)
             self._check_rate(prior)
+        real("expected_share", expected_share, "between 0 and 1", 0.0, 1.0)
+        exposure, counts, points, pixels, scores = self._sights(points, pixels, scores, stamps)
         if rotation is not None:
             instance("rotation", rotation, RotationPrior)
-        real("expected_share", expected_share, "between 0 and 1", 0.0, 1.0)
-        sights = self._sights(points, pixels, scores, stamps)
-        given = _Inputs(*sights, prior, expected_share, rotation, error_modes, parts)
-        if rotation is not None and not given.exposure.alone:
-            raise ValueError("a known rotation is that of a camera alone, not of a rig")
-        if rotation is not None:
-            given = given._replace(exposure=given.exposure.ahead())
-        found = self._found(given)
-        if self._alone or not found:
-            return found
-        return RigEstimate.of(found, given.exposure, given.counts)
+            if not exposure.alone:
+                raise ValueError("a known rotation is that of a camera alone, not of a rig")
+            exposure = exposure.ahead()
+        # 1. What can be used: finite, distinct, inside the image; packed relative to its median.
+        usable = find_usable(exposure, points, pixels, counts, rotation)
+        failure = unfit(exposure, pixels, usable, self.config.min_inliers)
+        if failure is not None:
+            return failure
+        ranking = _UNRANKED
+        if scores is not None:
+            ranking = np.argsort(-scores[usable.indices], kind="stable")
+        terms, assumed = of_frame(*self._assume(exposure.span), prior, rotation)
+        found = self._found(Observed(
+            packed(exposure, points, usable), ranking, terms, generator(self.config.seed), assumed,
+            exposure, points, usable, rotation, error_modes, parts,
+        ), prior, expected_share)  # fmt: skip
+        return found if self._alone or not found else RigEstimate.of(found, exposure, counts)
 
     def _check_rate(self, prior: Prior) -> None:
         """Refuse a rate that no sensor measures."""
@@ -275,29 +265,9 @@ class Localizer:
             )
         return checked_of_rig(self.rig, points, stamps)
 
-    def _found(self, given: _Inputs) -> Estimate | Failure:
-        exposure, counts, points, pixels, scores, prior, expected_share, rotation, *_ = given
-        terms, assumed = self._assume(exposure.span)
-        if prior is not None or rotation is not None:
-            terms, assumed = of_frame(terms, assumed, prior, rotation)
-        # 1. What can be used: finite, distinct, inside the image; packed relative to its median.
-        usable = find_usable(exposure, points, pixels, counts, rotation)
-        failure = unfit(exposure, pixels, usable, self.config.min_inliers)
-        if failure is not None:
-            return failure
-        observed = Observed(
-            packed(exposure, points, usable),
-            _UNRANKED if scores is None else np.argsort(-scores[usable.indices], kind="stable"),
-            terms,
-            generator(self.config.seed),
-            assumed,
-            exposure,
-            points,
-            usable,
-            rotation,
-            given.error_modes,
-            given.parts,
-        )
+    def _found(
+        self, observed: Observed, prior: Prior | None, expected_share: float
+    ) -> Estimate | Failure:
         # 2. Near the predicted motion, if the points agree with it (tracking).
         if prior is not None and prior.motion is not None:
             tracked = self._track(observed, prior, expected_share)
@@ -350,23 +320,18 @@ class Localizer:
         pixels: ArrayLike | None = None,
         stamps: Mapping[str, float] | None = None,
     ) -> Array:
-        """Return the distances (n,) px between pixels and the points projected by a motion.
+        """Return residuals (n,) px by another motion than the frame's own; NaN of unusable points.
 
-        Each point is projected at the time of its own row; NaN behind the camera. Arguments as of
-        :meth:`localize`.
+        Arguments as of :meth:`localize`.
         """
         exposure, counts, landmarks, seen, _ = self._sights(points, pixels, None, stamps)
-        shown, first = seen.copy(), 0
-        for place, (name, count) in enumerate(zip(exposure.names, counts, strict=True)):
-            own = slice(first, first + count)
-            axes, moved = self.rig.camera_from_rig[name]
-            for _ in range(_LOOKS):
-                at_rows = found.at_rows(exposure.row_time(place, shown[own]))
-                local = np.einsum("nij,nj->ni", at_rows[0], landmarks[own]) + at_rows[1]
-                shown[own] = seen_at(exposure.cameras[place], local @ axes.T + moved)
-            first += count
-        errors: Array = np.hypot(*(shown - seen).T)
-        return errors
+        usable = find_usable(exposure, landmarks, seen, counts, None)
+        own, state = packed(exposure, landmarks, usable), state_in(found, usable.centre)
+        lines = linearized(own.packed, len(own), state, shake_at(own.tau, found.shake))
+        errors = np.full(len(landmarks), np.nan)
+        errors[usable.indices] = np.linalg.norm(lines.errors, axis=1)
+        errors[usable.indices[np.isinf(own.squared_errors(state))]] = np.inf
+        return errors[usable.originals]
 
     def known_of(
         self, prior: Prior | None, span: float, rotation: RotationPrior | None = None
@@ -507,18 +472,12 @@ class Localizer:
             odd = left_out(self._search, observed, posterior, gate, known=tracked)
         if odd.failure is not None:
             return odd.failure
+        other = odd.other
         if parts is not None:
-            seen = observed.points[observed.usable.indices], posterior.inliers
-            axes = np.kron(np.eye(4), rotation_of(posterior.state))  # camera_from_map
-            other = parts.beside(odd.group, axes.T @ odd.other @ axes, *seen)
-            odd = odd._replace(other=axes @ other @ axes.T)
-            parts.add(
-                partial(look_at, observed, posterior, terms),
-                partial(neighbours_alike, observed, posterior), *seen,
-            )  # fmt: skip
+            other = parts.add(observed, posterior, terms, odd.group, other)
             if parts.part is not part:
                 effect = effect_of(parts.part)
         effect = widened(effect, posterior)
-        effect = effect._replace(covariance=effect.covariance + odd.other)
+        effect = effect._replace(covariance=effect.covariance + other)
         estimate = estimate_of(observed, posterior, best.samples, effect, tracked)
         return replace(estimate, left_out=odd.notice) if odd.notice else estimate

@@ -28,16 +28,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, Array1, Array2
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.rig import Rig
 from rs_localizer.core.scanning import ACROSS, REVERSED, ScanDirection
-from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import (
     ANGULAR_ACCELERATION,
     MOTION_PARAMETERS,
     POSE,
+    STATE_ANGULAR_ACCELERATION,
     TURN,
     VELOCITIES,
 )
@@ -46,6 +45,7 @@ from rs_localizer.estimation.points import find_usable, packed
 from rs_localizer.estimation.prior import state_in
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.stabilizer import RowRotation, RowRotations
+from rs_localizer.estimation.window import step_from
 from rs_localizer.native import entry
 
 # If the readout time is off by more than this share, single frames are better than tracked ones.
@@ -155,13 +155,10 @@ class _Way(NamedTuple):
     @classmethod
     def through(cls, before: _Look, now: _Look, after: _Look) -> _Way | None:
         """Return the motion; None: noise may be all that there is."""
-        times, ways, noise = np.zeros(2), np.zeros((2, 6)), np.zeros((6, 6))
-        back = now.found.rotation
-        for k, look in enumerate((before, after)):
-            times[k] = 1e-9 * (look.time_ns - now.time_ns)
-            ways[k, :3] = so3.log(np.ascontiguousarray(back @ look.found.rotation.T))
-            ways[k, 3:] = back @ (look.found.position - now.found.position)
-            noise += look.found.joint_covariance[POSE, POSE]
+        others = before, after
+        times = 1e-9 * np.array([look.time_ns - now.time_ns for look in others])
+        ways = np.array([step_from(now.found, look.found)[POSE] for look in others])
+        noise = np.sum([look.found.joint_covariance[POSE, POSE] for look in others], axis=0)
         way = ways[1] - ways[0]
         try:
             moves = way @ np.linalg.solve(noise, way) > _LEAST_MOTION
@@ -193,7 +190,7 @@ class ShutterWatch:
     def __init__(self, camera: Camera | None, threshold: float) -> None:
         self._gate, self._camera, self._usual = _GATE * threshold, camera, 0.0
         if camera is not None:
-            self._usual = camera.readout_time
+            self._usual = camera.readout_time  # s
             self._exposure = Rig.of(camera).exposure().ahead()
             self._direction = ScanDirection(camera.scan_direction)
             self._sideways = replace(camera, scan_direction=ACROSS[self._direction])
@@ -227,11 +224,6 @@ class ShutterWatch:
         self._unlike = 1.0  # by how much the square of what wanders is more than usual
 
     @property
-    def watches(self) -> bool:
-        """Whether there is a shutter to compare."""
-        return self._camera is not None
-
-    @property
     def rows_turn(self) -> bool:
         """Whether rows rotate otherwise than images: of a stabilized film, or near their rate."""
         return self._rotations.are_smooth
@@ -246,7 +238,7 @@ class ShutterWatch:
         if self._camera is None:
             return found
         own = np.r_[found.angular_velocity, found.linear_velocity]
-        sway = self._sway(float(np.linalg.norm(found.angular_velocity)))
+        sway = _SWAY * self._turned(float(np.linalg.norm(found.angular_velocity)))
         if self.error or sway:
             calibration = found.calibration_covariance.copy()
             calibration[TURN, TURN] += sway**2 * np.eye(3)
@@ -255,12 +247,10 @@ class ShutterWatch:
             found = replace(found, calibration_covariance=calibration)
         if not (self._reversed or self._across):
             return found
-        steps = [np.r_[np.zeros(6), -2.0 * own]]
+        steps, velocities = [np.r_[np.zeros(6), -2.0 * own]], np.r_[np.zeros(6), own]
         if self._across and self._seen is not None and self._seen.found.rotation is found.rotation:
             sideways = self._seen.over_columns()
-            steps = [sideways * np.repeat([1.0, sign], 6) for sign in (1.0, -1.0)]
-            for step in steps:
-                step[VELOCITIES] -= own
+            steps = [sideways * np.repeat([1.0, sign], 6) - velocities for sign in (1.0, -1.0)]
         joint = found.joint_covariance.copy()
         for step in steps:
             joint[:MOTION_PARAMETERS, :MOTION_PARAMETERS] += np.outer(step, step)
@@ -275,7 +265,11 @@ class ShutterWatch:
         ``jumped``: no camera goes there from the last frame. No motion within an image tells of
         such a way.
         """
-        if not found or self._camera is None or self._may_rest():
+        known = self.measured is not None and self.measured.deviation < _WELL_KNOWN * self._usual
+        known &= self.trusted and not self.kind and not self._rotations.is_likely
+        self._frames += bool(found)
+        may_rest = known and self._frames % _CYCLE >= _ON
+        if not found or self._camera is None or may_rest:
             self._looks.clear()
             return
         if jumped or (self._looks and time_ns <= self._looks[-1].time_ns):
@@ -305,19 +299,11 @@ class ShutterWatch:
             self._measure(now, way)
             self._judge(way.seconds)
 
-    def _may_rest(self) -> bool:
-        self._frames += 1
-        known = self.measured is not None and self.measured.deviation < _WELL_KNOWN * self._usual
-        known &= self.trusted and not self.kind and not self._rotations.is_likely
-        return known and self._frames % _CYCLE >= _ON
-
     def _look(self, time_ns: int, found: Estimate, points: Array, pixels: Array) -> _Look:
         usable = find_usable(self._exposure, points, pixels, [len(pixels)], None)
         seen, own = packed(self._exposure, points, usable), usable.indices
-        steady = Motion(
-            found.rotation, found.translation, found.angular_velocity, found.linear_velocity
-        )
-        state = state_in(steady, usable.centre)
+        state = state_in(found, usable.centre)
+        state[STATE_ANGULAR_ACCELERATION.start :] = 0.0
         lines = linearized(seen.packed, len(seen), state, np.zeros((len(seen), 6)))
         near = np.linalg.norm(lines.errors, axis=1) < self._gate  # NaN is not
         away = np.linalg.norm(points[own][near] - found.position, axis=1)
@@ -382,30 +368,23 @@ class ShutterWatch:
         speeds, changes = np.maximum(self._speeds, 0.0)
         return float(changes / (6.0 * speeds)) if speeds else 0.0
 
-    @property
-    def _longer(self) -> bool:
-        """Whether rows seem to take longer than is set."""
-        more = self._mean[0] - self._usual
-        return bool(more > _LONGER * math.sqrt(self._covariance[0, 0]))
-
-    @property
-    def _turned(self) -> float:
-        """Rate (rad/s, rms) at which images may be turned as wholes."""
-        most = self._rotations.most if self._longer and not self.kind else 0.0
-        rate = self._rotations.rate if self._rotations.is_likely else most
-        return 0.0 if self._across else rate / self._usual
-
-    def _sway(self, rate: float) -> float:
-        """Return by what angle (rad) images may be turned as wholes.
+    def _turned(self, rate: float = 0.0) -> float:
+        """Return the rate (rad/s, rms) at which images may be turned as wholes.
 
         ``rate``: rad per readout, of the camera. In the first frames, what looks like a longer
         readout time, or like rotations beside those between images, may be a stabilizer.
         """
-        if self.kind or self._across or self._rotations.are_enough:
-            return _SWAY * self._turned
-        longer = self._longer * (float(self._mean[0]) / self._usual - 1.0) * rate
-        early = _SWAY * max(self._rotations.most, longer) / self._usual
-        return max(_SWAY * self._turned, min(early, _CROPPED))
+        if self._across:
+            return 0.0
+        rotations, more = self._rotations, float(self._mean[0]) - self._usual
+        is_longer = more > _LONGER * math.sqrt(self._covariance[0, 0])
+        turned = rotations.most if is_longer and not self.kind else 0.0
+        if rotations.is_likely:
+            turned = rotations.rate
+        if not (self.kind or rotations.are_enough):
+            early = max(rotations.most, is_longer * more / self._usual * rate)
+            turned = max(turned, min(early, _CROPPED / _SWAY * self._usual))
+        return turned / self._usual
 
     def _along(self, axis: int) -> MeasuredReadout:
         """Return the readout time along an axis, if the shutter moves along it."""
@@ -432,10 +411,11 @@ class ShutterWatch:
             return
         if self._rotations.is_certain:
             self.kind, self.error = "stabilized", 0.0
+            turned = math.degrees(self._turned())
             self.fault = (
-                f"rows show rotations that differ by {math.degrees(self._turned):.0f} deg/s (rms) "
-                "from those between images, which no shutter does: is the film stabilized? Poses "
-                "are those of the picture that it shows; switch stabilization off"
+                f"rows show rotations that differ by {turned:.0f} deg/s (rms) from those between "
+                "images, which no shutter does: is the film stabilized? Poses are those of the "
+                "picture that it shows; switch stabilization off"
             )
         elif self.kind == "stabilized":
             self.kind = self.fault = ""
@@ -465,39 +445,38 @@ class ShutterWatch:
         """Judge whether readout time or direction are contradicted."""
         measured, usual = self._along(0), self._usual
         self.measured = measured if measured.deviation < usual else None
-        self.kind = self._name(measured, usual)
-        wrong, found = bool(self.kind), measured.readout_time
-        of_global, of_reversed = (measured.odds(value, usual) for value in (0.0, -usual))
+        self.kind, self.fault = self._contradiction(measured)
+        found, self.is_global = measured.readout_time, self.kind == "global"
         shorter = usual / max(abs(found), _GLOBAL * usual, measured.deviation)
         off = math.hypot(found - usual, measured.deviation)
-        self.error = off * max(shorter, 1.0) if wrong else 0.0
-        self.is_global = self.kind == "global"
+        self.error = off * max(shorter, 1.0) if self.kind else 0.0
+        of_global, of_reversed = (measured.odds(value, usual) for value in (0.0, -usual))
         self._reversed = self.kind == "reversed" or of_reversed > _SUSPICIOUS
         doubt = max(of_global, of_reversed)
-        if (wrong and found < FAR_OFF * usual) or doubt > _SUSPICIOUS:
+        if (self.kind and found < FAR_OFF * usual) or doubt > _SUSPICIOUS:
             self.trusted = False
         elif doubt < _SHOWN:
             self.trusted = True
 
-    def _name(self, measured: MeasuredReadout, usual: float) -> str:
-        """Describe the fault of the set readout time and return its kind, if it has one."""
-        self.fault, found, direction = "", measured.readout_time, self._direction
+    def _contradiction(self, measured: MeasuredReadout) -> tuple[str, str]:
+        """Return the kind of the fault of the set readout time, and a sentence; empty: none."""
+        found, usual, direction = measured.readout_time, self._usual, self._direction
         if not measured.contradicts(usual):
-            return ""
+            return "", ""
         if found < -_SURELY * measured.deviation:
-            self.fault = f"the shutter moves against scan_direction {direction}, in {measured}: is "
-            self.fault += f"it {REVERSED[direction]}?"
-            return "reversed"
-        if found < -_GLOBAL * usual:  # one of both
-            return ""
-        if not (self.kind or self._rotations.are_enough):  # vibration or a stop may look like it
-            return ""
-        kind, named = (
-            ("global", " (a global shutter)") if found < _GLOBAL * usual else ("duration", "")
+            return "reversed", (
+                f"the shutter moves against scan_direction {direction}, in {measured}: is it "
+                f"{REVERSED[direction]}?"
+            )
+        # One of both; or vibration or a stop, which may look like it.
+        if found < -_GLOBAL * usual or not (self.kind or self._rotations.are_enough):
+            return "", ""
+        is_global = found < _GLOBAL * usual
+        named = " (a global shutter)" if is_global else ""
+        return "global" if is_global else "duration", (
+            f"estimated readout time {measured}{named} differs from readout_time = "
+            f"{1e3 * usual:g} ms"
         )
-        self.fault = f"estimated readout time {measured}{named} differs from readout_time = "
-        self.fault += f"{1e3 * usual:g} ms"
-        return kind
 
 
 @entry

@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import Acceleration, CalibrationErrors, RefinementKind
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray, instance, real, whole_ns
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import ByCamera, Rig, RigEstimate
@@ -33,28 +32,28 @@ from rs_localizer.core.rotation_prior import RotationPrior
 from rs_localizer.core.state import (
     ANGULAR,
     LINEAR,
+    MOVE,
     PARAMETERS,
     POSE,
     TURN,
     VELOCITIES,
-    step_between,
 )
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.estimation.frames_together import CamerasTogether
 from rs_localizer.estimation.known_rotation import Aid, Foretold, LastFrame
 from rs_localizer.estimation.moved_part import MovedPart, MovedParts
-from rs_localizer.estimation.prior import Prior, beside, predicted, state_in, unchecked
+from rs_localizer.estimation.prior import Prior, beside, predicted, unchecked
 from rs_localizer.estimation.window import (
     FADING,
     LENGTH,
-    Gaussian,
     MotionSample,
     MotionWindow,
     acceleration_covariance,
     estimate_at,
     gaussian_of,
     predicted_estimate,
+    step_from,
     told_of,
     unshaken,
 )
@@ -163,48 +162,37 @@ class Tracker:
             raise ValueError(f"output_lag must be 0 to {LENGTH - 1} frames, got {output_lag!r}")
         real("max_prediction", max_prediction, "0 s or more", 0.0)
         self.localizer, self.remembers_motion = localizer, remembers_motion
-        self._allowing = localizer  # for a camera matrix that frames doubt
         self.output_lag, self.max_prediction = int(output_lag), max_prediction
         self._seen: deque[_Seen] = deque(maxlen=LENGTH)  # the newest last
-        self._images = RepeatedImages()
-        self.shutter = self._watch()
-        self.repeats = False  # whether the last frame shows an image that had come before
-        self._track: _Track | None = None
-        self._given: tuple[int, Prior] | None = None
-        rig = localizer.rig
-        alone = rig.exposure().ahead() if len(rig.cameras) == 1 else None
-        self.lens = LensWatch(alone if self.shutter.watches else None, localizer.config)
-        self.cameras = CamerasTogether(rig, localizer.config)
-        self._integrity = Integrity(localizer.config.acceleration)
-        self._parts = MovedParts(localizer.config.map_deviation)
+        rig, config = localizer.rig, localizer.config
+        camera, *others = rig.cameras.values()
+        rolls = camera.readout_time > 0.0 and find_solver(config.solver).rolling_shutter
+        is_watched = rolls and not others
+        self.shutter = ShutterWatch(camera if is_watched else None, config.inlier_threshold)
+        self.lens = LensWatch(rig.exposure().ahead() if is_watched else None, config)
+        self._integrity = Integrity(config.acceleration)
+        self._parts = MovedParts(config.map_deviation)
         self._last_ns: int | None = None
-        self._judged_ns: int | None = None
         self._too_close = 0
         if aid is not None:
             self._readout_time = localizer.camera.readout_time
         self.aid = aid
+        self.reset()
 
     def reset(self) -> None:
         """Forget all frames so far."""
-        self._track = self._given = None
-        self._integrity.reset()
-        self._judged_ns = None
-        self._parts.reset()
+        self._track: _Track | None = None
+        self._given: tuple[int, Prior] | None = None
+        self._judged_ns: int | None = None
         self._seen.clear()
-        self._images, self.repeats = RepeatedImages(), False
-        self.shutter.reset()
-        self.lens.reset()
+        self._images = RepeatedImages()
+        self.repeats = False  # whether the last frame shows an image that had come before
+        for each in (self._integrity, self._parts, self.shutter, self.lens):
+            each.reset()
         self.cameras = CamerasTogether(self.localizer.rig, self.localizer.config)
-        self._allowing = self.localizer
+        self._allowing = self.localizer  # for a camera matrix that frames doubt
         if self.aid is not None:
             self.aid.reset()
-
-    def _watch(self) -> ShutterWatch:
-        """Return the watch that compares the shutter of a single camera with its motion."""
-        config, cameras = self.localizer.config, list(self.localizer.rig.cameras.values())
-        timed = len(cameras) == 1 and cameras[0].readout_time > 0.0
-        watched = timed and find_solver(config.solver).rolling_shutter
-        return ShutterWatch(cameras[0] if watched else None, config.inlier_threshold)
 
     def stale(self, points: ArrayLike) -> BoolArray:
         """Return a mask of landmarks (n,3) of a single camera, often seen and never matched."""
@@ -250,12 +238,10 @@ class Tracker:
         track, most = self._track, self.localizer.config.velocity_prior
         if track is None or prior is None or prior.motion is None or not result or result.tracked:
             return False
-        before, seconds = track.estimate, 1e-9 * (time_ns - track.time_ns)
-        turn = so3.log(np.ascontiguousarray(before.rotation @ result.rotation.T))
-        way = result.position - before.position
+        step, seconds = step_from(track.estimate, result), 1e-9 * (time_ns - track.time_ns)
         return any(
-            0.0 < limit * seconds < np.linalg.norm(step)
-            for limit, step in ((most.angular, turn), (most.linear, way))
+            0.0 < limit * seconds < np.linalg.norm(step[part])
+            for limit, part in ((most.angular, TURN), (most.linear, MOVE))
         )
 
     def _checked(self, time_ns: int) -> int:
@@ -434,18 +420,11 @@ class Tracker:
             self._keep(_Seen(time_ns, again, points, pixels, stamps))
             return self.delayed
         share = 0.0 if self._track is None else self._track.share
+        modes = self.lens.errors_of(context.error_modes)
 
-        def find(prior: Prior | None, rotation: RotationPrior | None = None) -> Estimate | Failure:
+        def find(prior: Prior | None, rotation: RotationPrior | None) -> Estimate | Failure:
             return self._allowing.find(
-                points,
-                pixels,
-                scores,
-                prior,
-                share,
-                rotation,
-                stamps,
-                self.lens.errors_of(context.error_modes),
-                self._parts,
+                points, pixels, scores, prior, share, rotation, stamps, modes, self._parts
             )
 
         foreseen = None
@@ -467,8 +446,8 @@ class Tracker:
             self.cameras.add(result, terms, points, stamps)
             result = self.cameras.widened(result)
         if result:
-            result = self._judged(time_ns, result, points, prior)
             if pixels is not None:
+                result = self._judged(time_ns, result, seen[0], prior)
                 result = self.lens.widened(result, *seen)
             result = self.shutter.widened(result)
             if self.remembers_motion:
@@ -578,8 +557,7 @@ class Tracker:
             known = None if before is None else self.aid.ahead(readings, time_ns, before)
         if known is not None and known.prior is not None and known.prior.motion is not None:
             there, spread = known.prior.motion, np.asarray(known.prior.covariance)[POSE, POSE]
-            step = step_between(*(state_in(each, np.zeros(3)) for each in (track.estimate, there)))
-            return is_clear(step[POSE], pose + spread)
+            return is_clear(step_from(track.estimate, there)[POSE], pose + spread)
         last = track.window.newest
         if len(track.window) == 1:  # an image shows what it shows, however fast a camera may be
             last = gaussian_of(track.estimate, track.time_ns)
@@ -614,9 +592,15 @@ class Tracker:
             return
         known = {time_ns: k for k, time_ns in enumerate(reversed(window.times))}
         for seen in list(self._seen)[-1 - self.output_lag :]:
-            own = isinstance(seen.found, Estimate) and not seen.found.aided
-            if own and seen.time_ns in known:
-                seen.found = self._published(seen, window.before(known[seen.time_ns]))
+            if not seen.found or seen.found.aided or seen.time_ns not in known:
+                continue
+            found = estimate_at(seen.found, window.before(known[seen.time_ns]))
+            residuals = self.localizer.reprojection_errors(
+                found, seen.points, seen.pixels, seen.stamps
+            )
+            if isinstance(found.residuals, ByCamera):
+                residuals = found.residuals.like(residuals)
+            seen.found = replace(found, residuals=residuals, inliers=residuals <= seen.gate)
 
     def _covering(self, result: Estimate) -> Estimate:
         """Return the estimate with velocities as uncertain as frames show them, if rows may not.
@@ -624,33 +608,25 @@ class Tracker:
         Rows of a readout time that nobody knows may all have been exposed at once: then they show
         no motion, however fast the camera is.
         """
-        track, config = self._track, self.localizer.config
-        if track is None or self._trusts_motion():
+        track = self._track
+        seconds = 0.0 if track is None else 1e-9 * (result.time_ns - track.time_ns)
+        if track is None or self._trusts_motion() or not seconds > 0.0:
             return result
-        seconds = 1e-9 * (result.time_ns - track.time_ns)
-        if not seconds > 0.0:
-            return result
-        before = track.estimate
-        turn = so3.log(np.ascontiguousarray(before.rotation @ result.rotation.T))
-        moved = result.rotation @ (result.position - before.position)
-        off = np.concatenate([turn, moved]) * result.span / seconds
+        off = -result.span / seconds * step_from(result, track.estimate)[POSE]
         off -= np.concatenate([result.angular_velocity, result.linear_velocity])
         joint = result.joint_covariance.copy()
         joint[VELOCITIES, VELOCITIES] += np.outer(off, off)
         if self.shutter.is_global:  # rows say nothing of how that has changed since
-            changed = acceleration_covariance(config.acceleration, seconds, result.span)
+            capable = self.localizer.config.acceleration
+            changed = acceleration_covariance(capable, seconds, result.span)
             joint[VELOCITIES, VELOCITIES] += changed[VELOCITIES, VELOCITIES]
         return replace(result, joint_covariance=joint)
 
     def _judged(
-        self,
-        time_ns: int,
-        result: Estimate,
-        points: ArrayLike | Mapping[str, Sequence[ArrayLike]],
-        prior: Prior | None,
+        self, time_ns: int, result: Estimate, points: Array, prior: Prior | None
     ) -> Estimate:
-        """Return the estimate with its integrity; a rig, and no covariance, give none."""
-        if isinstance(points, Mapping) or np.isnan(result.joint_covariance[0, 0]):
+        """Return the estimate with its integrity; without a covariance it has none."""
+        if np.isnan(result.joint_covariance[0, 0]):
             return result
         seconds = 0.0 if self._track is None else 1e-9 * (time_ns - self._track.time_ns)
         numbers = self._integrity.numbers(result, points, prior, seconds)
@@ -676,29 +652,18 @@ class Tracker:
             return prior
         return None if prior is None else beside(prior, rotation)
 
-    def _published(self, seen: _Seen, motion: Gaussian) -> Estimate:
-        """Return the estimate of one of the last frames with this motion, and its residuals."""
-        assert isinstance(seen.found, Estimate)
-        found = estimate_at(seen.found, motion)
-        errors = self.localizer.reprojection_errors(found, seen.points, seen.pixels, seen.stamps)
-        residuals = np.where(np.isnan(found.residuals), np.nan, errors)
-        if isinstance(found.residuals, ByCamera):
-            residuals = found.residuals.like(residuals)
-        return replace(found, residuals=residuals, inliers=residuals <= seen.gate)
-
     def _remember(
         self, time_ns: int, told: MotionSample | None, result: Estimate, context: FrameContext
     ) -> None:
         """Keep what the next frames are to know of this one."""
-        track, share = self._track, float(np.mean(result.inliers))
+        track, share, vibrations = self._track, float(np.mean(result.inliers)), result.vibrations
         if track is not None and result.tracked:
             share = (1.0 - _NEWEST) * track.share + _NEWEST * share
-        window, swing = self._window(time_ns, told, result, context), unshaken(result)[2]
-        vibrations = result.vibrations
         if track is not None and track.vibrations.size:
             # Beside an aid they are of another kind: of what it leaves.
             is_new = vibrations.size and not result.aided
             vibrations = track.vibrations + (vibrations if is_new else 0.0)
+        window, swing = self._window(time_ns, told, result, context), unshaken(result)[2]
         self._track = _Track(result, time_ns, share, window, swing, _REMEMBERED * vibrations)
 
     def _window(

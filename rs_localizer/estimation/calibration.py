@@ -30,7 +30,7 @@ from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE, T
 from rs_localizer.estimation.hypotheses import Posterior
 from rs_localizer.estimation.linear_fit import ORDINARY, known_at, smooth_columns_of
 from rs_localizer.estimation.moved_part import MovedPart
-from rs_localizer.estimation.points import Observed, rays_of_lens
+from rs_localizer.estimation.points import Observed
 from rs_localizer.estimation.prior import SPEEDS, PriorTerms, terms_at
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.robust import eliminate, inverted
@@ -125,8 +125,11 @@ def calibration_effect(
     state, tau = posterior.state, some.tau
     lines = linearized(some.packed, some.count, state, shake_at(tau, posterior.shake))
     by_motion, image = lines.by_motion, lines.image
-    rotation = observed.rotation
-    rays = image if rotation is None else rays_of_lens(rotation, tau, image)
+    rotation, rays = observed.rotation, image
+    if rotation is not None:  # which was taken out
+        turned = rotation.at_rows(tau)[0]
+        local = np.einsum("nij,nj->ni", turned, np.column_stack([image, np.ones(len(image))]))
+        rays = local[:, :2] / local[:, 2:]
     of_side = some.camera
     columns = np.zeros((len(rays), 2, _ERRORS * len(exposure.cameras)))
     for place, side in enumerate(exposure.sides):

@@ -92,7 +92,7 @@ _ORDERS = [
 _CORNERS = ("upper left", "upper right", "lower right", "lower left")
 # Four points in a row are a marker's corners if they are out of a parallelogram by less than this
 # share of a side; of them another order explains so many, where ours does less than a half.
-_ROUND, _FLAT, _FIT = np.array([1.0, -1.0, 1.0, -1.0]), 0.01, 0.7
+_FLAT, _FIT = 0.01, 0.7
 # Gates fall by this part from step to step, to the last one, with its steps. With 0.7 two of 72
 # wrong matrices were lost on the way.
 _NARROWER, _LAST_STEPS = 0.8, 6
@@ -135,7 +135,7 @@ def left_out(
     wide = posterior.gate > _WIDE * threshold  # for noise, or for what another matrix explains
     failure = None if known else by_chance(observed, posterior, threshold)
     if failure is not None:
-        return LeftOut(failure, _rough(observed, posterior) if wide else "")
+        return LeftOut(failure)
     if not known and (wide or 2 * found < len(inliers)):
         failure = reordered(search, observed, threshold)
         if failure is not None:
@@ -186,12 +186,10 @@ def _cameras_apart(observed: Observed, inliers: BoolArray, second: _Group, thres
     if exposure.alone:
         return ""
     of = np.array([side.place for side in exposure.sides])[observed.observations.camera]
-    counts = np.bincount(of[second.chosen], minlength=len(exposure.names))
-    place = int(np.argmax(counts))
-    fitting = second.squared_errors[of == place] < (WIDEST_GATE * threshold) ** 2
-    if counts[place] < (1.0 - _ELSE) * counts.sum() or np.count_nonzero(
-        fitting
-    ) <= np.count_nonzero(inliers[of == place]):
+    place = int(np.bincount(of[second.chosen]).argmax())
+    own, fitting = of == place, second.squared_errors < (WIDEST_GATE * threshold) ** 2
+    is_mixed = np.mean(own[second.chosen]) < 1.0 - _ELSE
+    if is_mixed or np.count_nonzero(fitting & own) <= np.count_nonzero(inliers & own):
         return ""
     return (
         f"the points of {exposure.names[place]} have a motion of their own: its extrinsics, its "
@@ -210,8 +208,9 @@ def reordered(search: MotionSearch, observed: Observed, threshold: float) -> Fai
         part = replace(observed, ranking=observed.ranking[:0], observations=Observations.of(
             seen.points, seen.rays[by], seen.tau[by], seen.by_ray[by], seen.mounts, seen.camera[by]
         ))  # fmt: skip
-        fit, gate = search.from_rough(part, search.rough(part)), WIDEST_GATE * threshold
-        if fit.found and np.mean(part.observations.within(fit.state, gate)) > _FIT:
+        fit = search.from_rough(part, search.rough(part))
+        fitting = part.observations.within(fit.state, WIDEST_GATE * threshold)
+        if fit.found and np.mean(fitting) > _FIT:
             names = ", ".join(_CORNERS[order.index(k)] for k in range(4))
             return Failure(
                 Reason.CALIBRATION,
@@ -227,9 +226,9 @@ def _markers(observed: Observed) -> int:
     if len(usable) % 4 or len(usable) < len(observed.points):
         return 0
     corners = observed.points.reshape(-1, 4, 3)
-    skew = np.linalg.norm(np.einsum("mki,k->mi", corners, _ROUND), axis=1)
-    flat = skew < _FLAT * np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
-    return len(corners) if flat.all() else 0
+    skew = corners[:, 0] - corners[:, 1] + corners[:, 2] - corners[:, 3]
+    side = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
+    return len(corners) if np.all(np.linalg.norm(skew, axis=1) < _FLAT * side) else 0
 
 
 def _rough(observed: Observed, posterior: Posterior) -> str:
@@ -288,18 +287,16 @@ def _of_another_lens(
     """Return the failure of a frame that another matrix explains better than two motions."""
     area, count = _area(observed), observed.observations.count
     resized = off_centre(observed.exposure.cameras[0])
-    kinds = (False, True) if resized else (False,)
-    found = [_another_lens(search, observed, threshold, of_size) for of_size in kinds]
-    explained, group, numbers = max(
-        ((_evidence((group,), PARAMETERS + _LENS, count, area), group, numbers)
-         for group, numbers in found if np.any(group.chosen)),
-        key=lambda each: each[0], default=(-math.inf, None, _OF_K),
-    )  # fmt: skip
-    off = numbers - _OF_K
-    usual, other = off / _USUAL, off / _DEVIATIONS
-    if group is None or (
-        0.5 * (usual @ usual - other @ other) < np.log(_DEVIATIONS / _USUAL).sum()
-    ):
+    found = [
+        (_evidence((each[0],), PARAMETERS + _LENS, count, area), *each)
+        for of_size in ((False, True) if resized else (False,))
+        if (each := _another_lens(search, observed, threshold, of_size)) is not None
+    ]
+    if not found:
+        return None
+    explained, group, numbers = max(found, key=lambda each: each[0])
+    usual, other = (numbers - _OF_K) / _USUAL, (numbers - _OF_K) / _DEVIATIONS
+    if 0.5 * (usual @ usual - other @ other) < np.log(_DEVIATIONS / _USUAL).sum():
         return None
     first = _Group(posterior.inliers, posterior.state, posterior.squared_errors)
     parts = [(first,)] if second is None else [(first,), (first, second)]
@@ -348,32 +345,30 @@ def _evidence_without_a_marker(observed: Observed, posterior: Posterior, thresho
 
 def _another_lens(
     search: MotionSearch, observed: Observed, threshold: float, of_size: bool
-) -> tuple[_Group, Array]:
+) -> tuple[_Group, Array] | None:
     """Return the motion of most points with another matrix, and its numbers (3,): see _through.
 
     It is that of any image or, ``of_size``, of a resized one. Of that the principal point moves
     with the focal length, and both show before a wall, where neither does alone.
     """
     focal, last = observed.assumed.focal_length, WIDEST_GATE * threshold
-    camera, most = observed.exposure.cameras[0], _SAMPLE + _LENS
+    camera, enough = observed.exposure.cameras[0], observed.observations.count - _SAMPLE
     middle = centre_of(camera) / focal if of_size else 0.5 * np.array(camera.size) / focal
-    gate, state, lens, least = 0.0, np.zeros(0), np.zeros(_LENS), math.inf
-    enough = observed.observations.count - _SAMPLE
+    starts: list[tuple[int, float, Array, Array, float]] = []
     for length, scaled in product(_LENGTHS, (True,) if of_size else (False, True)):
-        tried = np.append(length, scaled * (length - 1.0) * middle)
-        through, circle = _through(observed, tried), length * GLOBAL_SHUTTER_SCALE * focal
+        lens = np.append(length, scaled * (length - 1.0) * middle)
+        through, circle = _through(observed, lens), length * GLOBAL_SHUTTER_SCALE * focal
         start = search.rough(through)
-        if start.found:
-            errors = through.observations.squared_errors(start.state)
-            near, off = int(np.count_nonzero(errors < circle**2)), float(np.median(errors))
-            found = min(near, enough)
-            if found > most or (of_size and found == most and off < least):
-                most, least, state, lens, gate = found, off, start.state, tried, 2.0 * circle
-        if most >= enough and not of_size:
-            break
-    nothing = _Group(np.zeros(0, np.bool_), state, np.zeros(0)), lens
-    if not len(state):
-        return nothing
+        errors = through.observations.squared_errors(start.state)
+        near = min(int(np.count_nonzero(errors < circle**2)), enough)
+        if start.found and near > _SAMPLE + _LENS:
+            closest = -float(np.median(errors)) if of_size else 0.0
+            starts.append((near, closest, start.state, lens, 2.0 * circle))
+            if near == enough and not of_size:
+                break
+    if not starts:
+        return None
+    _, _, state, lens, gate = max(starts, key=lambda each: each[:2])
     mean, whitened = _OF_K, np.diag(1.0 / _DEVIATIONS)
     if of_size:
         mean, whitened = lens, np.diag(1.0 / (_OF_SIZE * [lens[0], 1.0, 1.0]))
@@ -385,9 +380,10 @@ def _another_lens(
         step = _step(_through(observed, lens), state, whitened, whitened @ (lens - mean), gate)
         state, lens = apply_step(state, step[:PARAMETERS]), lens + step[PARAMETERS:]
         if not 0.5 * min(_LENGTHS) < lens[0] < 2.0 * max(_LENGTHS):  # NaN is not, either
-            return nothing
+            return None
     errors = _through(observed, lens).observations.squared_errors(state)
-    return _Group(errors < last**2, state, errors), lens
+    group = _Group(errors < last**2, state, errors)
+    return (group, lens) if group.chosen.any() else None
 
 
 def _through(observed: Observed, lens: Array) -> Observed:
@@ -435,11 +431,8 @@ def _surprise(total: int, size: int, sample: int, chance: float) -> float:
     """
     if size <= sample:
         return 0.0
-
-    def choices(n: int, k: int) -> float:
-        return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
-
-    return -(choices(total, size) + choices(size, sample) + (size - sample) * math.log(chance))
+    choices = math.log(math.comb(total, size) * math.comb(size, sample))
+    return -(choices + (size - sample) * math.log(chance))
 
 
 def by_chance(observed: Observed, posterior: Posterior, threshold: float) -> Failure | None:

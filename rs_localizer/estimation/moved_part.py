@@ -16,7 +16,7 @@ landmarks: a part is one thing, however many of its landmarks a frame shows.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -53,8 +53,7 @@ _OF_SHIFT = 2
 _ROUNDS = 4
 # Logarithms of both focal lengths, which may be another camera's: no part moves as that shows it.
 _OTHER_LENGTH, _BESIDE = 0.5, PARAMETERS + 2
-# Weights that make one number of a landmark's place, which no other place shares.
-_KEY = np.sqrt([2.0, 3.0, 5.0])
+_KEY_WEIGHTS = np.sqrt([2.0, 3.0, 5.0])
 # Of diagonals of normal equations, so that rounding leaves them positive.
 _RIDGE = 1e-9
 
@@ -90,6 +89,12 @@ class MovedPart(NamedTuple):
         return modes
 
 
+def keys_of(points: Array) -> Array:
+    """Return a number (n,) of each place (n,3), which no other place shares."""
+    keys: Array = (points * _KEY_WEIGHTS).sum(axis=1)
+    return keys
+
+
 def look_at(observed: Observed, posterior: Posterior, terms: PriorTerms) -> Look:
     """Return what a frame leaves of its inliers, and of points near them.
 
@@ -98,7 +103,8 @@ def look_at(observed: Observed, posterior: Posterior, terms: PriorTerms) -> Look
     """
     seen, variance = observed.observations, posterior.noise**2
     lines = linearized(seen.packed, len(seen), posterior.state, shake_at(seen.tau, posterior.shake))
-    near = _near(observed, lines.errors)
+    circle = GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length
+    near = np.sum(lines.errors**2, axis=1) < circle**2  # NaN is not
     by_motion = lines.by_motion[near]
     bend = posterior.bend[near] if posterior.bend.shape[1] else np.zeros((len(by_motion), 0))
     smooth = smooth_columns(by_motion, lines.image[near], bend)
@@ -110,14 +116,10 @@ def look_at(observed: Observed, posterior: Posterior, terms: PriorTerms) -> Look
     sizes = posterior.shared, math.hypot(posterior.declared, ORDINARY)
     return Look(
         observed.points[observed.usable.indices[near]],
-        np.concatenate([-lines.errors[near, :, None], by_place], axis=2),
-        columns,
-        prior,
-        sizes,
-        posterior.inliers[near],
-        WIDEST_GATE * posterior.gate,
+        np.concatenate([-lines.errors[near, :, None], by_place], axis=2), columns, prior, sizes,
+        posterior.inliers[near], WIDEST_GATE * posterior.gate,
         float(math.prod(observed.exposure.cameras[0].size)),
-    )
+    )  # fmt: skip
 
 
 class MovedParts:
@@ -142,20 +144,42 @@ class MovedParts:
         self._count, self._next = 0, 1
 
     def add(
-        self, look: Callable[[], Look], alike: Callable[[], bool], points: Array, inliers: BoolArray
+        self, observed: Observed, posterior: Posterior, terms: PriorTerms, group: BoolArray,
+        moment: Array,
+    ) -> Array:  # fmt: skip
+        """Take an accepted frame; return the moment of its left-out points, also if seen before.
+
+        A part is one thing, also where too few of its landmarks are in view to have a motion.
+
+        Args:
+            terms: what is known of its motion but for poses of other frames.
+            group: (n,) of its points those with a motion of their own; none: no others are found.
+            moment: (12,12) second moment of that motion about the frame's, as the result is.
+        """
+        points, inliers = observed.points[observed.usable.indices], posterior.inliers
+        self._look(observed, posterior, terms, points)
+        axes = np.kron(np.eye(4), rotation_of(posterior.state))  # camera_from_map
+        if group.any():
+            self._apart = points[group], axes.T @ moment @ axes
+        there, apart = self._apart
+        return axes @ (_mostly_out(there, points, inliers) * apart) @ axes.T
+
+    def _look(
+        self, observed: Observed, posterior: Posterior, terms: PriorTerms, points: Array
     ) -> None:
-        """Take an accepted frame of points (n,3), and whether errors of neighbours are alike."""
-        stays = self.part is not None and _mostly_out(self.part.points, points, inliers)
-        self._count += 1
+        """Compare the frame, of points (n,3), with others, if it is time."""
+        part, self._count = self.part, self._count + 1
+        stays = part is not None and _mostly_out(part.points, points, posterior.inliers)
+        if not self._looks and self._count < self._next:
+            return
+        look = look_at(observed, posterior, terms)
         if not self._looks:
-            if self._count < self._next:
-                return
             self._next += min(self._count, _RARELY)
-            if not alike():
+            if not neighbours_alike(look):
                 if not stays:
                     self.part = self.named = None
                 return
-        self._looks.append(look())
+        self._looks.append(look)
         if len(self._looks) in (1, _LOOKS):
             found = moved_part(self._looks, self._map_deviation)
             if found is not None or (len(self._looks) == _LOOKS and not stays):
@@ -163,20 +187,6 @@ class MovedParts:
         if len(self._looks) == _LOOKS:
             self.named = found
             self._later()
-
-    def beside(self, group: BoolArray, moment: Array, points: Array, inliers: BoolArray) -> Array:
-        """Return the second moment (12,12) of the motion of left-out points, also if seen before.
-
-        A part is one thing, also where too few of its landmarks are in view to have a motion.
-
-        Args:
-            group: (n,) of the points (n,3) those that have one; none: no others are found.
-            moment: their own, in the map's axes, as the result is.
-        """
-        if group.any():
-            self._apart = points[group], moment
-        there, moment = self._apart
-        return moment if _mostly_out(there, points, inliers) else np.zeros_like(moment)
 
     def discard(self) -> None:
         """Take nothing that was found for a part: the shutter is another one, or may be."""
@@ -190,24 +200,21 @@ class MovedParts:
 
 def _mostly_out(landmarks: Array, points: Array, inliers: BoolArray) -> bool:
     """Return whether of some landmarks more are left out than are inliers of points (n,3)."""
-    here = np.isin(points @ _KEY, landmarks @ _KEY)
+    here = np.isin(keys_of(points), keys_of(landmarks))
     return bool(2 * np.count_nonzero(here & inliers) < np.count_nonzero(here))
 
 
-def neighbours_alike(observed: Observed, posterior: Posterior) -> bool:
+def neighbours_alike(look: Look) -> bool:
     """Return whether errors of landmarks that are neighbours are alike, more than by chance.
 
     Moran's I, of both coordinates: it takes a fraction of what a search for parts does.
     """
-    seen = observed.observations
-    shake = shake_at(seen.tau, posterior.shake)
-    errors: Array = linearized(seen.packed, len(seen), posterior.state, shake).errors
-    near = np.flatnonzero(_near(observed, errors))
-    near = near[:: 1 + len(near) // _COMPARED]
-    count = len(near)
+    some = slice(None, None, 1 + len(look.points) // _COMPARED)
+    places, errors = look.points[some], look.rows[some, :, 0]
+    count = len(errors)
     if count <= 2 * _NEIGHBOURS:
         return False
-    off, places = errors[near] - errors[near].mean(axis=0), observed.observations.points[near]
+    off = errors - errors.mean(axis=0)
     products = sum(likeness(places, each, _NEIGHBOURS) for each in off.T)
     index = count * products / max(float(np.sum(off**2)), TINY)
     return index + 1.0 / count > _ALIKE / math.sqrt(2.0 * count * _NEIGHBOURS / 1.5)
@@ -246,13 +253,6 @@ def _likeness(points: Array2, numbers: Array1, neighbours: int, sorted_by: int) 
     return total / (count * neighbours)
 
 
-def _near(observed: Observed, errors: Array) -> BoolArray:
-    """Return which points lie near their places."""
-    circle = GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length
-    near: BoolArray = np.sum(errors**2, axis=1) < circle**2  # NaN is not
-    return near
-
-
 class _Frames(NamedTuple):
     """Looks of f frames at the same m landmarks; rows of those that a frame does not show are 0."""
 
@@ -269,9 +269,8 @@ class _Frames(NamedTuple):
     def of(cls, looks: Sequence[Look]) -> _Frames:
         """Put the landmarks of looks in order: of many, those that most frames show."""
         points = np.concatenate([look.points for look in looks])
-        keys = points @ _KEY
         _, first, which, seen = np.unique(
-            keys, return_index=True, return_inverse=True, return_counts=True
+            keys_of(points), return_index=True, return_inverse=True, return_counts=True
         )
         some = np.argsort(-seen, kind="stable")[:_COMPARED]
         place = np.full(len(seen), -1)
@@ -294,14 +293,6 @@ class _Frames(NamedTuple):
         return cls(points[first[some]], rows, columns, priors, shown, inliers, reach, area)
 
 
-class _Beside(NamedTuple):
-    """The points that are kept, and what motions and smooth errors take up of them."""
-
-    flat: Array  # (f,2m,p)
-    inverse: Array  # (f,p,p)
-    freedom: float
-
-
 class _Shifted(NamedTuple):
     """The frames, fitted with one part that is shifted."""
 
@@ -315,7 +306,7 @@ class _Split(NamedTuple):
 
     gain: float  # logarithm of their evidence, against one group
     part: BoolArray  # (m,)
-    found: BoolArray  # (m,) in either group
+    rest: BoolArray  # (m,)
     way: Array  # (3,) m
 
 
@@ -327,29 +318,29 @@ def moved_part(looks: Sequence[Look], map_deviation: float) -> MovedPart | None:
         map_deviation: m, as declared.
     """
     frames = _Frames.of(looks)
-    points = frames.points
     fitting: BoolArray = np.any(frames.inliers, axis=0)
-    alone = _beside(frames, frames.inliers, declared=False)
-    first = _fitted(frames, alone, np.zeros(len(points), np.bool_), frames.inliers)
-    starts = [_side(frames, alone, fitting)]
-    if not fitting.all():
-        starts.append(~fitting)
+    nobody = np.zeros(len(fitting), np.bool_)
+    alone = _fitted(frames, nobody, frames.inliers, declared=False)
+    starts = [_side(frames, fitting), ~fitting][: 1 if fitting.all() else 2]
     splits = [split for start in starts if (split := _settled(frames, start))]
     best = max(splits, key=lambda split: split.gain, default=None)
-    if best is None or best.gain < first.evidence + _LEAST_CHANCE:
+    if best is None or best.gain < alone.evidence + _LEAST_CHANCE:
         return None
     if float(np.linalg.norm(best.way)) <= _DECLARED * map_deviation:
         return None
-    part, rest, way = best.part & best.found, ~best.part & best.found, best.way
+    _, part, rest, way = best
     if np.count_nonzero(part) > np.count_nonzero(rest):
         part, rest, way = rest, part, -way
-    return MovedPart(points[part], points[rest], way)
+    return MovedPart(frames.points[part], frames.points[rest], way)
 
 
-def _beside(frames: _Frames, kept: BoolArray, declared: bool) -> _Beside:
+def _beside(frames: _Frames, kept: BoolArray, declared: bool) -> tuple[Array, Array, float]:
     """Return what motions and smooth errors take up of the points (f,m) that are kept.
 
     ``declared``: smooth errors are as large as is declared, and not as without a part.
+
+    Returns:
+        columns (f,2m,p), the inverse (f,p,p) of their products, and the freedom that they leave.
     """
     flat = (frames.columns * kept[:, :, None, None]).reshape(len(kept), -1, frames.columns.shape[3])
     normal = np.swapaxes(flat, 1, 2) @ flat
@@ -357,17 +348,17 @@ def _beside(frames: _Frames, kept: BoolArray, declared: bool) -> _Beside:
     places = np.arange(weight.shape[1])
     weight[:, places, places] *= 1.0 + _RIDGE
     inverse = np.asarray(np.linalg.inv(weight), np.float64)
-    freedom = 2.0 * np.count_nonzero(kept) - float(np.sum(inverse * normal))
-    return _Beside(flat, inverse, freedom)
+    return flat, inverse, 2.0 * np.count_nonzero(kept) - float(np.sum(inverse * normal))
 
 
-def _fitted(frames: _Frames, beside: _Beside, part: BoolArray, kept: BoolArray) -> _Shifted:
-    """Fit motions, smooth errors and the shift of a part to the points that are kept."""
+def _fitted(frames: _Frames, part: BoolArray, kept: BoolArray, declared: bool) -> _Shifted:
+    """Fit motions, smooth errors and the shift of a part to the points (f,m) that are kept."""
+    flat, inverse, freedom = _beside(frames, kept, declared)
     own = frames.rows * kept[:, :, None, None]
     own[..., 1:] *= part[:, None, None]
     own = own.reshape(len(own), -1, 4)
-    along = np.swapaxes(beside.flat, 1, 2) @ own
-    back = beside.inverse @ along
+    along = np.swapaxes(flat, 1, 2) @ own
+    back = inverse @ along
     square = np.sum(np.swapaxes(own, 1, 2) @ own - np.swapaxes(along, 1, 2) @ back, axis=0)
     information, target = square[1:, 1:].copy(), square[1:, 0]
     information += max(_RIDGE * float(np.trace(information)), TINY) * np.eye(3)
@@ -376,42 +367,36 @@ def _fitted(frames: _Frames, beside: _Beside, part: BoolArray, kept: BoolArray) 
     left = frames.rows[..., 0] - (frames.columns @ found[:, None, :, None])[..., 0]
     each = np.stack([left, left - frames.rows[..., 1:] @ way])
     squares = float(square[0, 0] - target @ way)
-    variance = max(squares / max(beside.freedom, 1.0), LEAST_NOISE**2)
-    inside = np.count_nonzero(kept)
+    variance = max(squares / max(freedom, 1.0), LEAST_NOISE**2)
     out = float(np.sum((frames.shown & ~kept) * np.log(frames.area)))
-    evidence = -inside * (math.log(2.0 * math.pi * variance) + 1.0) - out
+    evidence = -np.count_nonzero(kept) * (math.log(2.0 * math.pi * variance) + 1.0) - out
     return _Shifted(way, np.sum(each**2, axis=3) * frames.shown, evidence)
 
 
 def _settled(frames: _Frames, part: BoolArray) -> _Split | None:
     """Let each landmark join the group that it fits, until none changes; None if one vanishes."""
-    kept = frames.shown
-    beside = _beside(frames, kept, declared=True)
+    kept, fit = frames.shown, _fitted(frames, part, frames.shown, declared=True)
     for _ in range(_ROUNDS):
-        fit = _fitted(frames, beside, part, kept)
-        before, costs = part, fit.each.sum(axis=1)
+        before, costs = (part, kept), fit.each.sum(axis=1)
         part = costs[1] < costs[0]
-        near = frames.shown & (np.where(part, fit.each[1], fit.each[0]) < frames.reach**2)
-        moved, kept = not np.array_equal(near, kept), near
+        kept = frames.shown & (np.where(part, fit.each[1], fit.each[0]) < frames.reach**2)
         if np.count_nonzero(part) <= _OF_SHIFT:
             return None
-        if moved:
-            beside = _beside(frames, kept, declared=True)
-        elif np.array_equal(part, before):
+        if np.array_equal(part, before[0]) and np.array_equal(kept, before[1]):
             break
-    else:
-        fit = _fitted(frames, beside, part, kept)
+        fit = _fitted(frames, part, kept, declared=True)
     found: BoolArray = np.any(kept, axis=0)
     count, size = int(np.count_nonzero(found)), int(np.count_nonzero(part & found))
     if not _OF_SHIFT < size < count:
         return None
-    labels = math.lgamma(count + 1) - math.lgamma(size + 1) - math.lgamma(count - size + 1)
-    choices = labels + math.log(count) + 1.5 * math.log(2.0 * np.count_nonzero(kept))
-    return _Split(fit.evidence - choices, part, found, fit.way)
+    choices = math.log(math.comb(count, size) * count)
+    choices += 1.5 * math.log(2.0 * np.count_nonzero(kept))
+    return _Split(fit.evidence - choices, part & found, ~part & found, fit.way)
 
 
-def _side(frames: _Frames, beside: _Beside, fitting: BoolArray) -> BoolArray:
+def _side(frames: _Frames, fitting: BoolArray) -> BoolArray:
     """Return the side of a plane through the map whose shift explains most."""
+    columns, inverses, _ = _beside(frames, frames.inliers, declared=False)
     away = frames.points - frames.points[fitting].mean(axis=0)
     values, axes = np.linalg.eigh(away[fitting].T @ away[fitting])
     places = away @ axes / np.sqrt(np.maximum(values, 1e-4 * values[-1])) @ _ALONG.T
@@ -419,7 +404,7 @@ def _side(frames: _Frames, beside: _Beside, fitting: BoolArray) -> BoolArray:
     sides = np.concatenate([(places > edge).T for edge in edges]).astype(np.float64)
     own = frames.rows * frames.inliers[:, :, None, None]
     squares = np.zeros((len(sides), 4, 4))  # of a shift of all, and of the errors
-    for rows, flat, inverse in zip(own, beside.flat, beside.inverse, strict=True):
+    for rows, flat, inverse in zip(own, columns, inverses, strict=True):
         turned, count = np.swapaxes(rows, 1, 2), len(rows)
         along = (turned @ flat.reshape(count, 2, -1)).reshape(count, -1)
         by_side = (sides @ along).reshape(len(sides), 4, -1)

@@ -203,13 +203,13 @@ class Observations:
             self.mounts, self.camera[chosen],
         )  # fmt: skip
 
+    def __len__(self) -> int:
+        return len(self.points)
+
     @property
     def count(self) -> int:
         """Number of the points."""
         return len(self.points)
-
-    def __len__(self) -> int:
-        return self.count
 
     def lens_of(self, lenses: IntArray | None) -> IntArray | None:
         """Return which camera of a rig sees each point (n,), by that of each side; None: one."""
@@ -234,16 +234,6 @@ class Observations:
 # More points than this only take time.
 MOST_POINTS = 2500
 NEAREST = 1e-6  # m; points nearer than this would make any map useless
-
-
-def rays_of_lens(rotation: RotationPrior | None, tau: Array, rays: Array) -> Array:
-    """Return rays (n,2) at row times (n,) with the known rotation that was taken out."""
-    if rotation is None:
-        return rays
-    turned = rotation.at_rows(tau)[0]
-    local = np.einsum("nij,nj->ni", turned, np.column_stack([rays, np.ones(len(rays))]))
-    seen: Array = local[:, :2] / local[:, 2:]
-    return seen
 
 
 # Points farther away than this (m) are faults, and their squares would be infinite.
@@ -300,29 +290,19 @@ def find_usable(
 
     A known rotation is taken out of them.
     """
-    parts, first = [], 0
-    for place, count in enumerate(counts):
-        own = pixels[first : first + count]
-        tau = exposure.row_time(place, own)
-        parts.append((*_rays(exposure, place, own, tau, rotation), tau))
-        first += count
+    parts = []
+    for place, own in enumerate(np.split(pixels, np.cumsum(counts)[:-1])):
+        tau, (rays, by_ray, side) = exposure.row_time(place, own), exposure.look(place, own)
+        if rotation is not None:
+            gradient = exposure.mounts.gradients[0]  # of a camera alone
+            rays, by_ray = compensated(rays, tau, by_ray, gradient, rotation)
+        parts.append((rays, by_ray, side, tau))
     rays, by_ray, side, tau = (
         parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts, strict=True))
     )
     sizes = np.array([each.camera.size for each in exposure.sides], float)
     indices, originals, shown, centre, extent = _select(points, pixels, rays, side, sizes)
     return Usable(indices, originals, shown, centre, rays, by_ray, tau, side, extent)
-
-
-def _rays(
-    exposure: Exposure, place: int, pixels: Array, tau: Array, rotation: RotationPrior | None
-) -> tuple[Array, Array, IntArray]:
-    """Return rays as of :meth:`Exposure.look`, compensated."""
-    rays, by_ray, side = exposure.look(place, pixels)
-    if rotation is not None:
-        gradient = exposure.mounts.gradients[0]  # of a camera alone
-        rays, by_ray = compensated(rays, tau, by_ray, gradient, rotation)
-    return rays, by_ray, side
 
 
 @entry
@@ -339,30 +319,21 @@ def _select(
         outside as noise may have put them; the median (3,) of the points with a bearing; and width
         or height of what the pixels of a side fill, whichever is the largest.
     """
-    count = len(points)
-    seen, shown = np.empty(count, dtype=np.bool_), np.empty(count, dtype=np.bool_)
-    for i in range(count):
-        seen[i], shown[i] = np.isfinite(rays[i, 0]), True
-        for axis in range(2):
-            size = sizes[side[i], axis]
-            beyond = _MARGIN * size
-            shown[i] = shown[i] and -beyond < pixels[i, axis] < size + beyond
-    centre = np.zeros(3)
+    count, seen, size = len(points), np.isfinite(rays[:, 0]), sizes[side]
+    beyond = _MARGIN * size
+    within = (pixels > -beyond) & (pixels < size + beyond)
+    shown, centre, extent = within[:, 0] & within[:, 1], np.zeros(3), 0.0
     if np.any(seen):
         for axis in range(3):
             centre[axis] = median(points[:, axis][seen])
-    low, high = np.full(sizes.shape, np.inf), np.full(sizes.shape, -np.inf)
-    for i in range(count):
-        farthest = 0.0
-        for axis in range(3):
-            farthest = max(farthest, abs(points[i, axis] - centre[axis]))
-        seen[i] = seen[i] and shown[i] and farthest < _FARTHEST_POINT
-        if seen[i]:
-            for axis in range(2):
-                least, most = low[side[i], axis], high[side[i], axis]
-                low[side[i], axis] = min(least, pixels[i, axis])
-                high[side[i], axis] = max(most, pixels[i, axis])
-    extent = max(np.max(high - low), 0.0)
+    seen &= shown
+    for axis in range(3):
+        seen &= np.abs(points[:, axis] - centre[axis]) < _FARTHEST_POINT
+    for place in range(len(sizes)):
+        own = pixels[seen & (side == place)]
+        for axis in range(2):
+            if len(own) > 0:
+                extent = max(extent, np.max(own[:, axis]) - np.min(own[:, axis]))
     # The same landmarks have the same keys.
     keys = points[:, 0] + math.sqrt(2.0) * points[:, 1] + math.sqrt(3.0) * points[:, 2]
     keys[~seen] = np.inf

@@ -9,6 +9,7 @@ sure. It knows a solver only as a function that turns samples into models.
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -115,9 +116,7 @@ def _next(random: Any) -> Any:
 
 
 @entry
-def draw(
-    pool: Pool, drawn: int, tau: Array1, random: Random, samples: Out[IntArray2]
-) -> None:  # fmt: skip
+def draw(pool: Pool, drawn: int, tau: Array1, random: Random, samples: Out[IntArray2]) -> None:
     """Fill ``samples`` (h,n) with distinct points of the pool, row by row.
 
     Args:
@@ -146,19 +145,6 @@ def draw(
                 last = max(last, tau[point])
             if last - first >= _LEAST_ROW_SPREAD * pool.row_range:
                 break
-
-
-def _draw_all(
-    pools: list[Pool], drawn: IntArray, tau: Array, random: Random, samples: IntArray
-) -> None:
-    """Fill the samples from all pools by their shares, and count what each has given."""
-    first, share, total = 0, 0.0, sum(pool.share for pool in pools)
-    for k, pool in enumerate(pools):
-        share += pool.share
-        last = int(share / total * len(samples)) if k + 1 < len(pools) else len(samples)
-        draw(pool, int(drawn[k]), tau, random, samples[first:last])
-        drawn[k] += last - first
-        first = last
 
 
 # The best two hypotheses of every block are optimized: a six-point model of inliers alone is often
@@ -260,45 +246,44 @@ class Hypotheses(NamedTuple):
 
     solver: Solver
     block: int  # samples per block
+    most: int  # samples
     score_scale: float  # px, truncation of the error of minimal models
     final_scale: float  # px, truncation after local optimization: the inlier threshold
     noise: float  # px, expected standard deviation
     iterations: int  # of an iterative solver
+    confidence: float  # that a sample held inliers alone, when the search stops
     optimized: bool = True  # False: minimal models are judged as they are
 
 
-class Draws(NamedTuple):
-    """Pools that samples come from, and how many there may be."""
-
-    rotation: Array  # (3,3) to start from
-    pools: list[Pool]
-    confidence: float
-    most: int
-    random: Random
-
-
 def search(
-    observations: Observations, hypotheses: Hypotheses, prior: PriorTerms, draws: Draws,
-    start: Candidate,
+    observed: Observed, hypotheses: Hypotheses, prior: PriorTerms, pools: list[Pool],
+    rotation: Array, start: Candidate,
 ) -> Candidate:  # fmt: skip
-    """Return the best optimized hypothesis of up to ``draws.most`` minimal samples.
+    """Return the best optimized hypothesis of minimal samples.
 
-    Blocks draw equally from all pools. The search stops
-    when the chance that no sample so far held inliers alone, at the inlier ratios of the best
-    *optimized* motion, is below ``1 - draws.confidence``: minimal models see too few of the inliers
-    to count them (a six-point model sees a tenth). Only models that beat all minimal ones before
-    are optimized (LO-RANSAC: Chum, Matas, Kittler, DAGM 2003). Where none is, the best minimal
-    model counts, and the search ends late.
+    Blocks draw from all pools by their shares. The search stops when some sample probably held
+    inliers alone, at the inlier ratios of the best *optimized* motion: minimal models see too few
+    of the inliers to count them (a six-point model sees a tenth). Only models that beat all minimal
+    ones before are optimized (LO-RANSAC: Chum, Matas, Kittler, DAGM 2003). Where none is, the best
+    minimal model counts, and the search ends late.
+
+    Args:
+        rotation: (3,3) that solvers start from.
     """
-    solver, pools, mounts = hypotheses.solver, draws.pools, observations.mounts
+    observations, solver = observed.observations, hypotheses.solver
+    mounts, data = observations.mounts, observations.packed
     score, final, noise = hypotheses.score_scale, hypotheses.final_scale, hypotheses.noise
-    best, shares, drawn = start, None, np.zeros(len(pools), np.int64)
-    rotations, data = mounts.axes @ draws.rotation, observations.packed
+    best, inlier_ratios, drawn = start, None, np.zeros(len(pools), np.int64)
+    rotations, shares = mounts.axes @ rotation, np.cumsum([pool.share for pool in pools])
     bar = observations.count * score**2
-    left = draws.most if len(drawn) else 0
+    left = hypotheses.most if pools else 0
     while left > 0:
         samples = np.empty((min(hypotheses.block, left), solver.sample_size), np.int64)
-        _draw_all(pools, drawn, observations.tau, draws.random, samples)
+        ends = (shares / shares[-1] * len(samples)).astype(np.int64).tolist()
+        for k, (first, last) in enumerate(pairwise([0, *ends])):
+            own = samples[first:last]
+            draw(pools[k], int(drawn[k]), observations.tau, observed.random, own)
+            drawn[k] += last - first
         models = np.empty((solver.solutions, MODEL_SIZE, len(samples)))
         camera = observations.camera[samples[:, 0]]
         solver.solve(
@@ -310,18 +295,16 @@ def search(
         if hypotheses.optimized:
             found = Candidate(*optimize(states, costs, data, 2.0 * score, final, prior, noise))
         if found.cost < best.cost:
-            best, shares = found, None
-        if shares is None and best.found:
+            best, inlier_ratios = found, None
+        if inlier_ratios is None and best.found:
             near = observations.within(best.state, final)
-            shares = [np.count_nonzero(near[each.points]) / len(each.points) for each in pools]
+            inlier_ratios = np.array([np.mean(near[pool.points]) for pool in pools])
         bar = min(bar, costs[0])
-        left = draws.most - int(drawn.sum())
-        # The chance that none of the samples held inliers alone.
-        missed = 1.0
-        for share, count in zip(shares or (), drawn.tolist(), strict=False):
-            missed *= (1.0 - share**solver.sample_size) ** count
-        if missed < 1.0 - draws.confidence:
-            break
+        left = hypotheses.most - int(drawn.sum())
+        if inlier_ratios is not None:  # the chance that no sample held inliers alone
+            missed = np.prod((1.0 - inlier_ratios**solver.sample_size) ** drawn)
+            if missed < 1.0 - hypotheses.confidence:
+                break
     return best._replace(samples=int(drawn.sum()))
 
 
@@ -355,15 +338,15 @@ class MotionSearch:
         threshold = config.inlier_threshold
         self._noise = EXPECTED_NOISE * threshold
         self._optimizes = config.refinement != RefinementKind.NONE
-        expected = self._noise, config.solver_iterations
         wide = max(GLOBAL_SHUTTER_SCALE * focal_length, threshold)
         score = (SCORE_SCALE if self._optimizes else 1.0) * threshold
         scales = (wide, wide) if solver.rolling_shutter else (score, threshold)
         self._starts = Hypotheses(
-            start, _GLOBAL_SHUTTER_BLOCK, *scales, *expected, optimized=self._optimizes
-        )
-        self._motions = Hypotheses(
-            solver, _BLOCK, score, threshold, *expected, optimized=self._optimizes
+            start, _GLOBAL_SHUTTER_BLOCK, config.max_iterations, *scales, self._noise,
+            config.solver_iterations, config.confidence, self._optimizes,
+        )  # fmt: skip
+        self._motions = self._starts._replace(
+            solver=solver, block=_BLOCK, score_scale=score, final_scale=threshold
         )
 
     def find(self, observed: Observed) -> Candidate:
@@ -390,8 +373,8 @@ class MotionSearch:
         observations = observed.observations
         every, size = np.ones(observations.count, np.bool_), self._start.sample_size
         pools = pools_of(observations, size, every, observed.ranking, False)
-        draws = Draws(np.eye(3), pools, self._config.confidence, most, observed.random)
-        return search(observations, self._starts, held_terms(), draws, NOTHING)
+        starts = self._starts._replace(most=most)
+        return search(observed, starts, held_terms(), pools, np.eye(3), NOTHING)
 
     def _motion(self, observed: Observed, start: Candidate, most: int) -> Candidate:
         """Find the motion that most points agree on, from the solver's hypotheses."""
@@ -403,29 +386,19 @@ class MotionSearch:
             # The global-shutter pose is a hypothesis, too: at rest it is the best one.
             first = self.optimize(observed, start.state, self._near, observed.terms)
             agreeing = near & observations.within(first.state, self._config.inlier_threshold)
-            if np.count_nonzero(agreeing) < _AGREEING * np.count_nonzero(near):
-                first = self._facing(observed, start, near, first)
+            leads_on = np.count_nonzero(agreeing) >= _AGREEING * np.count_nonzero(near)
+            # Turning and moving stretch and shear the image of a plane that faces the camera, so
+            # that the pose leans by tens of degrees. From there the way leads to other leans, and
+            # samples of six noisy points tell leaning from moving no better.
+            if not leads_on:
+                leans, towards = leaning_less(observations.points, near, start.state, 1.0)
+                if leans:
+                    other = self.optimize(observed, towards, self._near, observed.terms)
+                    first = min(first, other, key=lambda each: each.cost)
         size = self._solver.sample_size
         pools = pools_of(observations, size, near, observed.ranking, True)
-        draws = Draws(
-            rotation_of(start.state), pools, self._config.confidence, most, observed.random
-        )
-        return search(observations, self._motions, observed.terms, draws, first)
-
-    def _facing(
-        self, observed: Observed, start: Candidate, near: BoolArray, found: Candidate
-    ) -> Candidate:
-        """Find a motion before a plane that faces the camera, if the start led nowhere.
-
-        Turning and moving stretch and shear the image of a plane, so that the global-shutter pose
-        leans by tens of degrees; from there the way leads to other leans, and samples of six noisy
-        points tell leaning from moving no better.
-        """
-        leans, towards = leaning_less(observed.observations.points, near, start.state, 1.0)
-        if not leans:
-            return found
-        other = self.optimize(observed, towards, self._near, observed.terms)
-        return other if other.cost < found.cost else found
+        motions, turn = self._motions._replace(most=most), rotation_of(start.state)
+        return search(observed, motions, observed.terms, pools, turn, first)
 
     def optimize(
         self, observed: Observed, state: Array, first_scale: float, terms: PriorTerms,

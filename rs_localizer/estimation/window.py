@@ -14,27 +14,26 @@ the variance of these accelerations is
 
     e' Q e - tr(Q M),      e = P^-1 x,      M = cov(e) = P^-1 - P^-1 V P^-1.
 
-A variance ``r`` times as large makes it ``(r - 1) tr(Q M Q M)`` in the mean. So the scales of a
-tripod, of a hand and of a car are found within a few frames, from below and from above.
+A variance ``r`` times as large makes it ``(r - 1) tr(Q M Q M)`` in the mean: so scales of a tripod,
+of a hand and of a car are found within a few frames.
 
 Real accelerations last longer than this model's, and those of noise end at once. So the next image
 is predicted by what fades soon, and the errors of a moment that no image shows are those of
 accelerations that last.
 
-Who rests may start at any time, before a scale can be learnt anew. So the motion is a mixture: in
-the last transitions accelerations are those that were learnt, or three or ten times as large, up to
-the settings'. Its mean and its region are weighed as those of one frame (docs/estimator.md).
-
-A hand that images see once or thrice a second has turned back between them: their way does not tell
-its velocity. So velocities in images may also differ from those of the trajectory, by deviations of
-four sizes, each a part of the mixture.
+The motion is a mixture, weighed as that of one frame (docs/estimator.md). Who rests may start
+before a scale can be learnt anew: in the last transitions accelerations are those that were learnt,
+or three or ten times as large. A hand that images see once or thrice a second has turned back
+between them: velocities in images may also differ from the trajectory's, by deviations of four
+sizes.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -48,6 +47,7 @@ from rs_localizer.core.shutter import Motion, carried, motion_of
 from rs_localizer.core.state import (
     ANGULAR,
     PARAMETERS,
+    POSE,
     POSE_SIZE,
     STATE_ANGULAR,
     STATE_ANGULAR_ACCELERATION,
@@ -86,8 +86,8 @@ _LEAST_CHANGE, _MOST_CHANGE, _ROUNDS = 0.2, 25.0, 2
 _SETTLED = 0.1
 # Of the configured deviations: a tripod's, and that of a blow.
 _LEAST_SCALE, _MOST_SCALE = 0.03, 100.0
-# Accelerations of the last transitions may be so many times as large as they were learnt. In the
-# mean, the logarithm of the odds that they are not: at 30 Hz one start in two seconds.
+# Factors of the accelerations of the last transitions, and, in the mean, the logarithm of the odds
+# that they are as they were learnt: at 30 Hz one start in two seconds.
 _GROWN, _ODDS, _RECENT = (3.0, 10.0), math.log(20.0), 3
 # Deviations of velocities in images from the trajectory's, over configured accelerations times the
 # time between images, if that (s) is longer: below, they change no twist of hands nor of a phone.
@@ -99,8 +99,8 @@ _UNSHAKEN = np.eye(PARAMETERS, PARAMETERS + 3 * len(MIDDLE_VALUES))
 _UNSHAKEN[TURN, PARAMETERS:] = -np.kron(MIDDLE_VALUES, np.eye(3))
 _UNSHAKEN[ANGULAR, PARAMETERS:] = -np.kron(MIDDLE_RATES, np.eye(3))
 _ORIGIN = np.zeros(3)
-# Places of the deviations of a velocity: each turn has its own, all moves share the last.
-_AXES = (0, 1, 2, 3, 3, 3)
+# Places of the deviations of a pose's axes: each turn has its own, all moves share the last.
+_OF_AXES = np.array([0, 1, 2, 3, 3, 3])
 # Powers of a time in velocities and accelerations, by the places of a step.
 _ORDERS = np.repeat([0.0, 0.0, 1.0, 1.0, 2.0, 2.0], 3)
 
@@ -109,13 +109,12 @@ class Gaussian(NamedTuple):
     """A motion at a time; s, m and rad, camera_from_map."""
 
     time_ns: int
-    state: Array  # (24,)
-    covariance: Array  # (18,18) of a step
+    state: Array1  # (24,)
+    covariance: Array2  # (18,18) of a step
 
     def per_readout(self, span: float) -> tuple[Motion, Array]:
         """Return the motion and its covariance, per readout of ``span`` s."""
-        units, state = span**_ORDERS, self.state.copy()
-        state[12:] *= units[6:]
+        state, units = _per(self.state, span)
         motion = motion_of((rotation_of(state), *state[POSE_SIZE - 3 :].reshape(5, 3)))
         return motion, self.covariance * np.outer(units, units)
 
@@ -130,18 +129,24 @@ class MotionSample(NamedTuple):
 
     def over(self, seconds: float) -> MotionSample:
         """Return the same per so many s: per readout, or of one per readout by its inverse."""
-        units, state = seconds**_ORDERS, self.state.copy()
-        state[12:] *= units[6:]
+        state, units = _per(self.state, seconds)
         information = self.information / np.outer(units, units)
         return MotionSample(self.time_ns, state, information, self.gradient / units)
+
+
+def _per(state: Array, seconds: float) -> tuple[Array, Array]:
+    """Return a state (24,) per so many s in place of one, and the units (18,) of its step."""
+    units, state = seconds**_ORDERS, state.copy()
+    state[POSE_SIZE:] *= units[POSE.stop :]
+    return state, units
 
 
 class _Solved(NamedTuple):
     """Motions of n samples, behind the start."""
 
-    states: Array  # (n+1,24)
-    covariances: Array  # (n+1,18,18)
-    deviations: Array  # (4,) as they were learnt
+    states: Array2  # (n+1,24)
+    covariances: Array3  # (n+1,18,18)
+    deviations: Array1  # (4,) as they were learnt
     surprise: float  # squared distance of the last sample from its prediction
     evidence: float  # logarithm, of all samples
 
@@ -159,7 +164,7 @@ class _Swinging(NamedTuple):
     def of(cls, states: Array, own: tuple[Array, Array], deviations: Array) -> _Swinging:
         """Let velocities differ by deviations (n,4)."""
         informations, gradients = own
-        precisions, spreads = deviations[:, _AXES] ** -2.0, np.zeros_like(informations)
+        precisions, spreads = deviations[:, _OF_AXES] ** -2.0, np.zeros_like(informations)
         inner = informations[:, VELOCITIES, VELOCITIES] + precisions[:, :, None] * np.eye(6)
         spreads[:, VELOCITIES, VELOCITIES] = np.linalg.inv(inner)
         across = informations @ spreads
@@ -181,7 +186,7 @@ class _Swinging(NamedTuple):
         return found._replace(evidence=found.evidence + self.evidence)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class MotionWindow:
     """The last frames with a pose that hang together.
 
@@ -190,17 +195,18 @@ class MotionWindow:
         configured: (4,) deviations of accelerations, angular about the camera's axes (rad/s^2) and
             linear, by the settings.
         deviations: (4,) the same, learnt.
-        samples: the frames after it.
         readout_share: deviation of the readout time, as a part of it.
+        samples: the frames after the start.
+        filtered: their motions, of each by the samples until then; first with accelerations as
+            they were learnt.
     """
 
     start: Gaussian
     configured: Array
     deviations: Array
-    samples: tuple[MotionSample, ...] = ()
-    solved: tuple[_Solved, ...] = ()  # filtered; first with accelerations as they were learnt
     readout_share: float = 0.0
-    mixed: dict[int, Gaussian] = field(default_factory=dict)  # by row, those that were asked for
+    samples: tuple[MotionSample, ...] = ()
+    filtered: tuple[_Solved, ...] = ()
 
     @classmethod
     def begin(
@@ -208,12 +214,7 @@ class MotionWindow:
     ) -> MotionWindow:
         """Begin with a motion of which no other frame tells."""
         configured = _deviations(acceleration)
-        return cls(start, configured, configured, readout_share=readout_share)
-
-    @property
-    def newest(self) -> Gaussian:
-        """The motion of the last frame, as all frames tell."""
-        return self.before(0)
+        return cls(start, configured, configured, readout_share)
 
     @property
     def times(self) -> list[int]:
@@ -223,24 +224,28 @@ class MotionWindow:
     @property
     def surprise(self) -> float:
         """Squared distance of the last frame's points from its prediction; chi-squared of 18."""
-        return self.solved[0].surprise if self.solved else 0.0
+        return self.filtered[0].surprise if self.filtered else 0.0
 
     def __len__(self) -> int:
         return len(self.samples) + 1
 
+    @cached_property
+    def newest(self) -> Gaussian:
+        """The motion of the last frame, of which no later one tells."""
+        return self._mixed(self.filtered, len(self.samples)) if self.samples else self.start
+
+    @cached_property
+    def _earlier(self) -> list[Gaussian]:
+        """The motions of the others, given all frames."""
+        solved = self._solved(0, True)
+        return [self._mixed(solved, row) for row in range(len(self.samples))]
+
     def before(self, frames: int) -> Gaussian:
         """Return the motion so many frames before the last one, given all frames."""
-        if not self.solved:
-            return self.start
-        last = len(self.samples)
-        if last - frames not in self.mixed:
-            # Of the last one no later sample tells.
-            rows = range(last) if frames else range(last, last + 1)
-            solved = self._solutions(0, True) if frames else self.solved
-            self.mixed.update({row: self._mixture(solved, row) for row in rows})
-        return self.mixed[last - frames]
+        return self._earlier[-frames] if frames else self.newest
 
-    def _mixture(self, solved: Sequence[_Solved], row: int) -> Gaussian:
+    def _mixed(self, solved: Sequence[_Solved], row: int) -> Gaussian:
+        """Return the motion of a row by all solutions."""
         odds = np.zeros(len(solved))
         odds[0] = _ODDS
         # From where the camera is: a map's origin may be thousands of kilometres away.
@@ -268,13 +273,12 @@ class MotionWindow:
 
         ``lasting`` is the time (s) in which the accelerations fade that its covariance is of.
         """
-        last = self.newest
-        if time_ns == last.time_ns:
+        last, seconds = self.newest, 1e-9 * (time_ns - self.newest.time_ns)
+        if seconds == 0.0:
             return last
         state, transport, added = _predicted(
-            last.state, 1e-9 * (time_ns - last.time_ns), self.deviations, self.readout_share,
-            float(lasting),
-        )  # fmt: skip
+            last.state, seconds, self.deviations, self.readout_share, float(lasting)
+        )
         return Gaussian(time_ns, state, transport @ last.covariance @ transport.T + added)
 
     def at(self, time_ns: int) -> Gaussian | None:
@@ -291,42 +295,40 @@ class MotionWindow:
         nothing = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
         silent = MotionSample(time_ns, self.samples[row].state, *nothing)
         there = replace(self, samples=(*self.samples[:row], silent, *self.samples[row:]))
-        return there._through(0).before(len(self.samples) - row)
+        return there.before(len(self.samples) - row)
 
     def joined(self, sample: MotionSample) -> MotionWindow:
         """Return the window with one more frame, and with learnt accelerations."""
         start, samples = self.start, (*self.samples, sample)
         if len(samples) >= LENGTH:
-            states, covariances, *_ = self.solved[0]
-            start = Gaussian(samples[0].time_ns, states[1], covariances[1])
-            samples = samples[1:]
-        return replace(self, start=start, samples=samples)._through(_ROUNDS)
+            states, covariances, *_ = self.filtered[0]
+            start, samples = Gaussian(samples[0].time_ns, states[1], covariances[1]), samples[1:]
+        there = replace(self, start=start, samples=samples)
+        filtered = there._solved(_ROUNDS, False)
+        return replace(there, deviations=filtered[0].deviations, filtered=filtered)
 
-    def _through(self, rounds: int) -> MotionWindow:
-        """Return the window with the motion by its samples, learning from them in some rounds."""
-        solved = self._solutions(rounds, False)
-        return replace(self, deviations=solved[0].deviations, solved=solved, mixed={})
+    def _solved(self, rounds: int, smooths: bool) -> tuple[_Solved, ...]:
+        """Return the motions by all samples or, not smoothed, by those until each.
 
-    def _solutions(self, rounds: int, smooths: bool) -> tuple[_Solved, ...]:
-        """Return the motions by all samples or, not smoothed, by those until each."""
+        ``rounds``: of learning the deviations.
+        """
         _, states, informations, gradients = map(np.array, zip(*self.samples, strict=True))
         seconds: Array = np.diff(self.times).astype(np.float64) * 1e-9
 
         def solved(
             told: tuple[Array, Array], deviations: Array, rounds: int, grown: float
         ) -> _Solved:
-            return _Solved(*_solve(
-                seconds, states, *told, self.start.state, self.start.covariance,
-                np.stack([self.configured, deviations]), self.readout_share, rounds, smooths, grown,
-            ))  # fmt: skip
+            return _solve(
+                seconds, states, *told, self.start, self.configured, deviations,
+                self.readout_share, rounds, smooths, grown,
+            )  # fmt: skip
 
         told = informations, gradients
         found = [solved(told, self.deviations, rounds, 1.0)]
         learnt = found[0].deviations
         found += [solved(told, learnt, 0, grown) for grown in _GROWN]
         for swing in _SWINGS if np.median(seconds) > _SLOW else ():
-            swings = swing * np.outer(seconds, self.configured)
-            beside = _Swinging.of(states, told, swings)
+            beside = _Swinging.of(states, told, swing * np.outer(seconds, self.configured))
             found.append(beside.of_images(solved(beside.told, learnt, 0, 1.0)))
         return tuple(found)
 
@@ -349,25 +351,18 @@ def _predicted(
     ))  # fmt: skip
     if lasting != FADING:
         _, transport = carried(numbers, seconds, lasting)
-    added = _added(seconds, deviations, lasting)
-    for i in range(6):
-        for j in range(6):
-            moved = predicted[12 + i] * predicted[12 + j]
-            added[i, j] += (readout_share * seconds) ** 2 * moved
+    added, moved = _added(seconds, deviations, lasting), predicted[12:18]
+    added[POSE, POSE] += (readout_share * seconds) ** 2 * np.outer(moved, moved)
     return predicted, transport, added
 
 
 @entry
 def _added(seconds: float, deviations: Array1, lasting: float) -> Array:
     """Return the covariance (18,18) that new accelerations (4,) add, in SI units."""
-    unit = singer(abs(seconds), lasting)
-    noise = np.zeros((PARAMETERS, PARAMETERS))
-    for i in range(3):
-        for j in range(3):
-            for axis in range(6):
-                square = deviations[min(axis, 3)] ** 2
-                noise[6 * i + axis, 6 * j + axis] = square * unit[i, j]
-    return noise
+    unit, added = singer(abs(seconds), lasting), np.zeros((3, 6, 3, 6))
+    for axis in range(6):
+        added[:, axis, :, axis] = deviations[_OF_AXES[axis]] ** 2 * unit
+    return added.reshape(PARAMETERS, PARAMETERS)
 
 
 def acceleration_covariance(acceleration: Acceleration, dt: float, readout_time: float) -> Array:
@@ -412,39 +407,38 @@ def singer(seconds: float, fading: float) -> Array:
 
 @entry
 def _solve(
-    seconds: Array1, states: Array2, informations: Array3, gradients: Array2, start: Array1,
-    start_covariance: Array2, scales: Array2, readout_share: float, rounds: int, smooths: bool,
+    seconds: Array1, states: Array2, informations: Array3, gradients: Array2, start: Gaussian,
+    configured: Array1, learnt: Array1, readout_share: float, rounds: int, smooths: bool,
     grown: float,
-) -> tuple[Array, Array, Array, float, float]:  # fmt: skip
-    """Filter, learn deviations and perhaps smooth: the fields of :class:`_Solved`.
+) -> _Solved:  # fmt: skip
+    """Filter, learn deviations and perhaps smooth.
 
     Args:
         seconds: (n,) of each transition.
-        scales: (2,4) deviations by the settings, and as they are known.
+        configured, learnt: (4,) deviations by the settings, and as they are known.
         rounds: of learning.
         smooths: all samples tell of all motions.
         grown: factor of the deviations of the last transitions.
     """
-    count, configured, deviations = len(seconds), scales[0], scales[1].copy()
+    count, deviations = len(seconds), learnt.copy()
     square, row = (count + 1, PARAMETERS, PARAMETERS), (count + 1, STATE_SIZE)
-    predicted, filtered = np.empty(row), np.empty(row)
+    predicted, found, covariances = np.empty(row), np.empty(row), np.empty(square)
     added, transports, knowns = np.empty(square), np.empty(square), np.empty(square)
-    covariances = np.empty(square)
     while True:
-        filtered[0], covariances[0], surprise, evidence = start, start_covariance, 0.0, 0.0
+        found[0], covariances[0], surprise, evidence = start.state, start.covariance, 0.0, 0.0
         for k in range(count):
             own = enlarged(deviations, configured, grown if k >= count - _RECENT else 1.0)
             predicted[k], transports[k], added[k] = _predicted(
-                filtered[k], seconds[k], own, readout_share, FADING
+                found[k], seconds[k], own, readout_share, FADING
             )
             spread = transports[k] @ covariances[k] @ transports[k].T + added[k]
-            known, narrower = inverse_of(spread)
-            covariances[k + 1], left = inverse_of(informations[k] + known)
-            right = gradients[k] + known @ step_between(states[k], predicted[k])
+            knowns[k], narrower = inverse_of(spread)
+            covariances[k + 1], left = inverse_of(informations[k] + knowns[k])
+            right = gradients[k] + knowns[k] @ step_between(states[k], predicted[k])
             step = covariances[k + 1] @ right
-            filtered[k + 1], knowns[k] = apply_step(states[k], step), known
-            moved = step_between(predicted[k], filtered[k + 1])
-            surprise = np.sum(moved * (known @ moved))
+            found[k + 1] = apply_step(states[k], step)
+            moved = step_between(predicted[k], found[k + 1])
+            surprise = np.sum(moved * (knowns[k] @ moved))
             surprise += np.sum(step * (informations[k] @ step - 2.0 * gradients[k]))
             evidence -= narrower + left + 0.5 * surprise
         if rounds == 0 and not smooths:
@@ -452,12 +446,12 @@ def _solve(
         scores, weight = np.zeros((4, 3)), 1.0
         for k in range(count - 1, -1, -1):
             known, after = knowns[k], covariances[k + 1].copy()
-            step = step_between(predicted[k], filtered[k + 1])
+            step = step_between(predicted[k], found[k + 1])
             pull, spread = known @ step, known - known @ after @ known
             _score(seconds[k], deviations, pull, spread, weight, scores)
             weight *= _FORGETTING
             gain = covariances[k] @ transports[k].T @ known
-            filtered[k] = apply_step(filtered[k], gain @ step)
+            found[k] = apply_step(found[k], gain @ step)
             kept = np.eye(PARAMETERS) - gain @ transports[k]  # no difference of large ones (Joseph)
             whole = kept @ covariances[k] @ kept.T + gain @ (after + added[k]) @ gain.T
             covariances[k] = 0.5 * (whole + whole.T)
@@ -470,7 +464,7 @@ def _solve(
         deviations[:3] = np.maximum(deviations[:3], _LEAST_SHARE * deviations[:3].max())
         is_settled = np.max(np.abs(np.log(deviations / before))) < _SETTLED
         rounds = 0 if is_settled else rounds - 1
-    return filtered, covariances, deviations, surprise, evidence
+    return _Solved(found, covariances, deviations, surprise, evidence)
 
 
 @entry
@@ -485,18 +479,13 @@ def _score(
     seconds: float, deviations: Array1, pull: Array1, spread: Array2, weight: float, scores: Array2
 ) -> None:
     """Add a transition to scores (4,3) of the deviations: squared, expected, information."""
-    unit, own = singer(seconds, FADING), np.empty((3, 3))
+    unit = singer(seconds, FADING)
     for axis in range(6):
-        place = min(axis, 3)
-        variance = deviations[place] ** 2
-        for i in range(3):
-            for j in range(3):
-                own[i, j] = 0.0
-                for k in range(3):
-                    own[i, j] += variance * unit[i, k] * spread[6 * k + axis, 6 * j + axis]
-                squared = pull[6 * i + axis] * pull[6 * j + axis]
-                scores[place, 0] += weight * variance * unit[i, j] * squared
-            scores[place, 1] += weight * own[i, i]
+        place = _OF_AXES[axis]
+        noise, along = deviations[place] ** 2 * unit, pull[axis::6].copy()
+        own = noise @ spread[axis::6, axis::6].copy()
+        scores[place, 0] += weight * np.sum(along * (noise @ along))
+        scores[place, 1] += weight * np.trace(own)
         scores[place, 2] += weight * np.sum(own * own.T)
 
 
@@ -513,8 +502,7 @@ def _told_by_points(covariance: Array2, known: Array2) -> Array:
     back = np.linalg.inv(factor)
     part = back @ (known / units) @ back.T
     values, vectors = np.linalg.eigh(0.5 * (part + part.T))
-    roots = np.ascontiguousarray(vectors * np.sqrt(np.maximum(1.0 - values, 0.0)))
-    half = np.ascontiguousarray(factor) @ roots
+    half = factor.copy() @ (vectors * np.sqrt(np.maximum(1.0 - values, 0.0)))
     told: Array = (half @ half.T) * units
     return told
 
@@ -527,15 +515,15 @@ def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array, Array]:
     """
     shake, joint = estimate.shake, estimate.joint_covariance
     swing, jacobian = np.zeros((PARAMETERS, PARAMETERS)), _UNSHAKEN[:, : len(joint)]
-    numbers = _numbers(estimate)
+    motion = Motion(**numbers_by_name(estimate))
     if not len(shake) and len(joint) == PARAMETERS:
-        return Motion(**numbers), joint, swing, jacobian
+        return motion, joint, swing, jacobian
     values, rates = MIDDLE_VALUES[: len(shake)], MIDDLE_RATES[: len(shake)]
     turned = so3.exp(values @ shake)
-    still = Motion(**numbers | {
-        "rotation": turned @ estimate.rotation, "translation": turned @ estimate.translation,
-        "angular_velocity": estimate.angular_velocity - rates @ shake,
-    })  # fmt: skip
+    still = replace(
+        motion, rotation=turned @ motion.rotation, translation=turned @ motion.translation,
+        angular_velocity=motion.angular_velocity - rates @ shake,
+    )  # fmt: skip
     squares = np.square(shake).sum(axis=1) / 3.0
     swing[TURN, TURN] = (values**2 @ squares) * np.eye(3)
     swing[ANGULAR, ANGULAR] = (rates**2 @ squares) * np.eye(3)
@@ -547,8 +535,7 @@ def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array, Array]:
 def gaussian_of(estimate: Estimate, time_ns: int) -> Gaussian:
     """Return the motion of one frame without vibration."""
     motion, covariance, _, _ = unshaken(estimate)
-    units, state = estimate.span**-_ORDERS, state_in(motion, _ORIGIN)
-    state[12:] *= units[6:]
+    state, units = _per(state_in(motion, _ORIGIN), 1.0 / estimate.span)
     return Gaussian(time_ns, state, covariance * np.outer(units, units))
 
 
@@ -561,8 +548,7 @@ def told_of(
         known: what was known of that motion before, in the map's frame.
         rotation: beside which that is; None: it is of the whole motion.
     """
-    beside = estimate if rotation is None else rotation.beside(estimate)
-    motion, covariance, _, _ = unshaken(beside)
+    motion, covariance, _, _ = unshaken(estimate if rotation is None else rotation.beside(estimate))
     information, slope = np.zeros((PARAMETERS,) * 2), np.zeros(PARAMETERS)
     state = state_in(motion, _ORIGIN)
     add_prior(known, state, 1.0, information, slope)
@@ -580,16 +566,16 @@ def estimate_at(estimate: Estimate, gaussian: Gaussian) -> Estimate:
     """
     known, spread = gaussian.per_readout(estimate.span)
     if not len(estimate.shake):
-        return estimate.with_joint_covariance(spread, **_numbers(known), twist_known=True)
+        return estimate.with_joint_covariance(spread, **numbers_by_name(known), twist_known=True)
     motion, covariance, _, jacobian = unshaken(estimate)
     joint = estimate.joint_covariance
     gain = np.linalg.solve(covariance, jacobian @ joint).T
-    step = gain @ step_between(state_in(motion, _ORIGIN), state_in(known, _ORIGIN))
+    step = gain @ step_from(motion, known)
     state = apply_step(state_in(estimate, _ORIGIN), step[:PARAMETERS])
     whole, _ = Gaussian(gaussian.time_ns, state, spread).per_readout(1.0)
     joint = joint + gain @ (spread - covariance) @ gain.T
     return estimate.with_joint_covariance(
-        0.5 * (joint + joint.T), **_numbers(whole),
+        0.5 * (joint + joint.T), **numbers_by_name(whole),
         shake=estimate.shake + step[PARAMETERS:].reshape(-1, 3), twist_known=True,
     )  # fmt: skip
 
@@ -602,9 +588,17 @@ def predicted_estimate(nearest: Estimate, gaussian: Gaussian, swing: Array) -> E
     """
     motion, covariance = gaussian.per_readout(nearest.span)
     return nearest.with_joint_covariance(
-        covariance + swing, **_numbers(motion), shake=np.zeros((0, 3)), time_ns=gaussian.time_ns
-    )
+        covariance + swing, **numbers_by_name(motion), shake=np.zeros((0, 3)),
+        time_ns=gaussian.time_ns,
+    )  # fmt: skip
 
 
-def _numbers(motion: Motion) -> dict[str, Array]:
+def step_from(one: Motion, other: Motion) -> Array:
+    """Return the step (18,) from one motion to another: rad and m in the axes of the first."""
+    step: Array = step_between(state_in(one, _ORIGIN), state_in(other, _ORIGIN))
+    return step
+
+
+def numbers_by_name(motion: Motion) -> dict[str, Array]:
+    """Return the numbers of a motion, or of what has one, by their names."""
     return {each.name: getattr(motion, each.name) for each in fields(Motion)}

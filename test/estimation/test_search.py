@@ -3,6 +3,7 @@
 """The loop with mock solvers: what it draws, when it stops, what it keeps; and with real ones."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -48,10 +49,10 @@ def problem(outlier_share):
 def run(observations, solver, *pools):
     """The search by pools of equal shares."""
     mock = replace(find_solver("r6p_vcwt"), solve=solver)
-    hypotheses = search.Hypotheses(mock, 50, 8.0, 2.0, 1.0, 5)
-    shares = [search.Pool.of(points, ROWS, 1.0, 0) for points in pools]
-    draws = search.Draws(np.eye(3), shares, 0.99, 2000, search.generator(1))
-    return search.search(observations, hypotheses, FREE, draws, search.NOTHING)
+    hypotheses = search.Hypotheses(mock, 50, 2000, 8.0, 2.0, 1.0, 5, 0.99)
+    alike = [search.Pool.of(points, ROWS, 1.0, 0) for points in pools]
+    observed = SimpleNamespace(observations=observations, random=search.generator(1))
+    return search.search(observed, hypotheses, FREE, alike, np.eye(3), search.NOTHING)
 
 
 EVERYTHING = np.arange(100)
