@@ -18,7 +18,6 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.rotation_prior import ROTATION, WHOLE, RotationPrior
-from rs_localizer.core.shake import COMBINATIONS
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.core.types import Estimate
@@ -40,7 +39,6 @@ _MISSED = (0.0, 1.0, 30.0)
 _COMPLETE = 0.99
 # Size of vibration, over an ordinary one, that is rounding.
 _LEAST = 1e-4
-_IN_TURNS = np.kron(np.linalg.pinv(COMBINATIONS), np.eye(3))
 
 
 class CoupledTurn(NamedTuple):
@@ -97,12 +95,6 @@ def with_turn(covariance: Array, rotation: RotationPrior) -> Array:
     joint[turn, turn] = rotation.covariance[turn, turn]
     whole: Array = IN_FUNCTIONS @ joint @ IN_FUNCTIONS.T
     return whole
-
-
-def turn_of(estimate: Estimate) -> Array:
-    """Return the in-frame turn (54,) of an estimate with one."""
-    turn: Array = _IN_TURNS @ estimate.shake.ravel()
-    return turn
 
 
 class LastFrame(NamedTuple):

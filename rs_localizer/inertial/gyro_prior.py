@@ -19,16 +19,16 @@ from __future__ import annotations
 import math
 from collections import deque
 from copy import copy
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.rate_spline import rotations_at_knots, spline
 from rs_localizer.core.reasons import ImuReason, Unused
 from rs_localizer.core.rotation_prior import ROTATION, WHOLE, RotationPrior
-from rs_localizer.core.shake import COMBINATIONS, shake_functions
 from rs_localizer.core.shutter import Motion, carried, motion_of, numbers_of
 from rs_localizer.core.state import (
     ANGULAR,
@@ -41,11 +41,10 @@ from rs_localizer.core.state import (
     step_between,
 )
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.known_rotation import LastFrame, turn_of, whole_covariance
-from rs_localizer.estimation.linear_fit import BLOCKS, MIDDLE, TURNS
+from rs_localizer.estimation.known_rotation import LastFrame, whole_covariance
+from rs_localizer.estimation.linear_fit import MIDDLE
 from rs_localizer.estimation.prior import Prior, predicted, state_in
-from rs_localizer.estimation.window import MotionSample
-from rs_localizer.inertial.gravity import gravity_seen
+from rs_localizer.estimation.window import MotionSample, numbers_by_name
 from rs_localizer.inertial.oddities import LEANING, ComparedTurns, told_by_numbers
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.status import InertialSettings, InertialStatus
@@ -54,6 +53,7 @@ from rs_localizer.inertial.turning import (
     BIAS,
     DELAY,
     MOUNT,
+    SCALE,
     WITHIN,
     GyroscopeErrors,
     Read,
@@ -79,11 +79,6 @@ _LEAST_GAIN = 0.03
 _WATCHED, _CONTRADICTIONS = 12, 4
 # A delay is hardly known whose deviation is this part of what it was at first.
 _HARDLY = 0.25
-# Row times at which a turn beside the gyroscope's is compared with none, and the 99.9 % quantile of
-# chi-squared of its twelve numbers: a half cycle per readout and more.
-_ROWS, _MOST_SWING = (-0.375, -0.125, 0.125, 0.375), 32.91
-# Size of vibration, over an ordinary one, that does not matter.
-_LEAST_SWING = 0.3
 # s: over which rates have changed as they will.
 _LATELY = 0.1
 _TURNING = np.r_[ANGULAR, ANGULAR_ACCELERATION]
@@ -92,34 +87,31 @@ MIDDLE_POSE = np.zeros_like(MIDDLE)
 MIDDLE_POSE[TURN] = MIDDLE[TURN]
 # Variances of a pose that nothing predicts, rad^2 and m^2.
 _ANYWHERE = 1e4
+STANDARD_GRAVITY = 9.80665  # m/s^2
+_LONGEST, _SHORTEST = 0.4, 0.1  # s of readings of an accelerometer
+# rad, of a direction of gravity: biases of consumer accelerometers, and how TF knows their axes.
+# Directions that are known worse than the second are none.
+_LEAST_LEAN, _MOST_LEAN = 0.03, 0.5
 _NO_READINGS = Unused(ImuReason.LATE, "no readings of the exposure have come")
 
 
-class _Foreseen(NamedTuple):
-    """A motion beside the known rotation before its points, with the gyroscope's numbers."""
-
-    motion: Motion
-    covariance: Array  # (72,72), or of the motion alone (18,18)
-    tied: Array  # (72,10), or (18,10), covariance with the numbers
-
-
 class GyroPrediction(NamedTuple):
-    """The gyroscope's knowledge of a frame."""
+    """The gyroscope's knowledge of a frame: of the motion beside the rotation within it, too."""
 
-    readings: Read
     rotation: RotationPrior
     prior: Prior | None  # of the motion beside the rotation; None: nothing follows from before
-    foreseen: _Foreseen | None
+    motion: Motion | None  # likewise
+    covariance: Array  # (72,72) of that motion and the in-frame turn
+    tied: Array  # (72,10) covariance with what the gyroscope is off by
 
     def of(self, last: Estimate) -> Estimate:
         """Return the estimate that it makes of the last frame's."""
-        assert self.foreseen is not None
-        motion, known = self.foreseen.motion, self.rotation
-        numbers = {each.name: getattr(motion, each.name) for each in fields(Motion)}
-        numbers["angular_velocity"], numbers["angular_acceleration"] = known.rate, known.change
-        return last.with_joint_covariance(
-            whole_covariance(self.foreseen.covariance), **numbers, shake=known.shake
-        )
+        assert self.motion is not None
+        known = self.rotation
+        numbers = numbers_by_name(self.motion)
+        numbers |= {"angular_velocity": known.rate, "angular_acceleration": known.change}
+        covariance = whole_covariance(self.covariance)
+        return last.with_joint_covariance(covariance, **numbers, shake=known.shake)
 
 
 class GyroscopeTrack:
@@ -141,13 +133,9 @@ class GyroscopeTrack:
 
     def _prepare(self) -> None:
         settings = self._settings
-        deviations = np.repeat(
-            [
-                _BIAS_DEVIATION, settings.time_offset_deviation, settings.scale_deviation,
-                settings.mount_deviation,
-            ],
-            [3, 1, 3, 3],
-        )  # fmt: skip
+        deviations = np.zeros(ERRORS)
+        deviations[BIAS], deviations[DELAY] = _BIAS_DEVIATION, settings.time_offset_deviation
+        deviations[SCALE], deviations[MOUNT] = settings.scale_deviation, settings.mount_deviation
         self._before_all = np.diag(deviations**2)
         self._walk = np.zeros(ERRORS)  # per s
         self._walk[BIAS], self._walk[DELAY] = settings.gyroscope_bias_walk**2, _DELAY_WALK**2
@@ -216,9 +204,14 @@ class GyroscopeTrack:
             return found
         self.forget_motion()
         found = self.ahead(samples, middle_ns, None) or self._strayed(samples, middle_ns)
-        if found is None:
-            return None
-        return found._replace(prior=self._gravity(samples, middle_ns))
+        up = self._settings.gravity_in_map
+        if found is None or up is None:
+            return found
+        seen = gravity_seen(samples, middle_ns, self.errors)
+        if seen is None:
+            return found
+        prior = Prior(gravity=seen[0], gravity_deviation=seen[1], gravity_in_map=up)
+        return found._replace(prior=prior)
 
     def _strayed(self, samples: ImuSamples, middle_ns: int) -> GyroPrediction | None:
         """Begin anew, if a delay that is hardly known leads away from the samples."""
@@ -244,21 +237,24 @@ class GyroscopeTrack:
         if found is None:
             return None
         if last is None:
-            return GyroPrediction(found, rotation_by(found, self.errors), None, None)
-        foreseen = self._carried(found, last, 1e-9 * (middle_ns - last.middle_ns))
-        rotation = RotationPrior(*found[:3], foreseen.covariance, predicted=True)
-        prior = predicted(foreseen.motion, foreseen.covariance[:PARAMETERS, :PARAMETERS])
-        return None if prior is None else GyroPrediction(found, rotation, prior, foreseen)
-
-    def _gravity(self, samples: ImuSamples, middle_ns: int) -> Prior | None:
-        up = self._settings.gravity_in_map
-        seen = None if up is None else gravity_seen(samples, middle_ns, self.errors)
-        if up is None or seen is None:
+            rotation, tied = rotation_by(found, self.errors), np.zeros((WHOLE, ERRORS))
+            tied[ROTATION] = found.by_errors[WITHIN] @ self.errors.covariance
+            covariance = rotation.covariance.copy()
+            others = np.setdiff1d(np.arange(PARAMETERS), ROTATION)
+            covariance[others, others] = _ANYWHERE
+            return GyroPrediction(rotation, None, None, covariance, tied)
+        motion, covariance, tied = self._carried(found, last, 1e-9 * (middle_ns - last.middle_ns))
+        rotation = RotationPrior(*found[:3], covariance, predicted=True)
+        prior = predicted(motion, covariance[:PARAMETERS, :PARAMETERS])
+        if prior is None:
             return None
-        return Prior(gravity=seen[0], gravity_deviation=seen[1], gravity_in_map=up)
+        return GyroPrediction(rotation, prior, motion, covariance, tied)
 
-    def _carried(self, found: Read, last: LastFrame, seconds: float) -> _Foreseen:
-        """Return the motion after a turn, beside the rotation within this frame."""
+    def _carried(self, found: Read, last: LastFrame, seconds: float) -> tuple[Motion, Array, Array]:
+        """Return the motion after a turn, beside the rotation within this frame.
+
+        With its covariance (72,72), and that with the errors (72,10), as of a prediction.
+        """
         assert found.between is not None
         still = replace(last.motion, angular_velocity=np.zeros(3), angular_acceleration=np.zeros(3))
         later, transport = carried(numbers_of(still), seconds / self._readout_time, last.fading)
@@ -284,7 +280,7 @@ class GyroscopeTrack:
         covariance = crossed + crossed.T + by_errors @ known @ by_errors.T
         covariance += by_told @ found.rest @ by_told.T
         covariance[motions, motions] += transport @ last.covariance @ transport.T + last.added
-        return _Foreseen(motion, 0.5 * (covariance + covariance.T), tied + by_errors @ known)
+        return motion, 0.5 * (covariance + covariance.T), tied + by_errors @ known
 
     def changed(self, samples: ImuSamples, seconds: float) -> float:
         """Return the mean squared change of an axis' rates (rad/s)^2 in so many s, of late."""
@@ -307,22 +303,22 @@ class GyroscopeTrack:
         told = told.over(found.span)
         told.state[STATE_ANGULAR] -= prediction.rotation.smooth_rate
         told.state[STATE_ANGULAR_ACCELERATION] -= prediction.rotation.change
-        foreseen = prediction.foreseen or self._of_rotation(prediction, told)
-        motions = slice(0, PARAMETERS)
-        spread, information = foreseen.covariance[motions, motions].copy(), told.information
-        start = state_in(foreseen.motion, np.zeros(3))
+        motions, start, information = slice(0, PARAMETERS), told.state.copy(), told.information
+        if prediction.motion is not None:
+            start = state_in(prediction.motion, np.zeros(3))
+        else:  # it knows the rotation alone
+            start[STATE_ANGULAR] = start[STATE_ANGULAR_ACCELERATION] = 0.0
+        spread = prediction.covariance[motions, motions].copy()
         pull = told.gradient + information @ step_between(start, told.state)
         gain = np.asarray(np.linalg.inv(np.eye(PARAMETERS) + spread @ information), np.float64)
         step, gained = gain @ spread @ pull, spread @ information @ gain @ spread
         seen = np.ix_(_SEEN, _SEEN)
         expected = gained[seen] + _LEAST_GAIN * spread[seen]
         far = float(step[_SEEN] @ np.linalg.solve(expected, step[_SEEN])) / _MOST_DISTANCE
-        if found.aided:
-            far = max(far, _swung(found, prediction.rotation) / _MOST_SWING)
         if far > 1.0:  # a prediction that is too far off counts as much as one at the limit
             information, pull = information / far, pull / far
             gain[:] = np.linalg.inv(np.eye(PARAMETERS) + spread @ information)
-        self._learn(foreseen.tied[motions], gain, information, pull)
+        self._learn(prediction.tied[motions], gain, information, pull)
         agrees = bool(far <= 1.0)
         self._contradictions.append(not agrees)
         self._age += 1
@@ -357,20 +353,6 @@ class GyroscopeTrack:
         self.errors = replace(self.errors, mean=mean, covariance=covariance)
         self._tied = gain @ tied
 
-    def _of_rotation(self, prediction: GyroPrediction, told: MotionSample) -> _Foreseen:
-        """Return what it says of a frame that follows no other, near what its points tell."""
-        state = told.state
-        motion = Motion(
-            state[:9].reshape(3, 3), state[9:12], np.zeros(3), state[15:18],
-            linear_acceleration=state[21:24],
-        )  # fmt: skip
-        covariance = prediction.rotation.covariance.copy()
-        others = np.setdiff1d(np.arange(PARAMETERS), ROTATION)
-        covariance[others, others] = _ANYWHERE
-        tied = np.zeros((WHOLE, ERRORS))
-        tied[ROTATION] = prediction.readings.by_errors[WITHIN] @ self.errors.covariance
-        return _Foreseen(motion, covariance, tied)
-
     def _oddity(self) -> str:
         """Return in words what it has that the settings hardly allow for; empty: nothing."""
         if self._is_another():
@@ -386,20 +368,33 @@ def rotation_by(found: Read, errors: GyroscopeErrors) -> RotationPrior:
     return RotationPrior(*found[:3], covariance, predicted=False)
 
 
-def _swung(found: Estimate, rotation: RotationPrior) -> float:
-    """Return the squared size, in deviations, of a vibration that points see beside it."""
-    turn = turn_of(rotation.beside(found))
-    place = BLOCKS["turn"]
-    known = rotation.covariance[place, place] + _LEAST_SWING**2 * np.eye(TURNS)
-    covariance = _SWINGS @ known @ _SWINGS.T
-    seen = _SWINGS @ turn
-    return float(seen @ np.linalg.solve(covariance, seen))
+def gravity_seen(
+    samples: ImuSamples, middle_ns: int, errors: GyroscopeErrors
+) -> tuple[Array, float] | None:
+    """Return a vector (3,) along gravity in camera axes, and its deviation in rad; or None.
 
-
-# Derivatives (12,54) of turns at the row times by an in-frame turn.
-_SWINGS = np.asarray(
-    np.kron(shake_functions(np.array(_ROWS))[0] @ COMBINATIONS, np.eye(3)), np.float64
-)
+    An accelerometer measures gravity, upwards, and the acceleration of the camera. One reading does
+    not tell them apart, but no camera accelerates one way for long. So the gyroscope rotates the
+    readings of the last moments into the present axes, and their mean is the direction. Their
+    differences, from each other and from g in length, give its uncertainty. None without an
+    accelerometer, where the readings are too few, or where the camera accelerates too much.
+    """
+    if samples.specific_force is None:
+        return None
+    now_ns = middle_ns - round(1e9 * errors.time_offset)  # by the clock of the samples
+    chosen = np.abs(samples.times_ns - now_ns) <= round(1e9 * _LONGEST)
+    times = np.asarray(1e-9 * (samples.times_ns[chosen] - now_ns), np.float64)
+    if len(times) < 2 or not (times[0] < -_SHORTEST and times[-1] >= 0.0):
+        return None
+    cubics = spline(times, samples.angular_velocity[chosen] - errors.bias)
+    rotations = rotations_at_knots(times, cubics)
+    forces = np.einsum("nji,nj->ni", rotations, samples.specific_force[chosen])
+    force = forces.mean(axis=0)
+    length = float(np.linalg.norm(force))
+    scatter = math.sqrt(float(np.mean(np.var(forces, axis=0))))
+    strange = math.hypot(length - STANDARD_GRAVITY, scatter) / STANDARD_GRAVITY
+    deviation = math.hypot(_LEAST_LEAN, strange)
+    return None if deviation > _MOST_LEAN else (-force / length, deviation)
 
 
 def _is_positive(joint: Array) -> bool:

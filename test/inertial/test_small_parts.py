@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.inertial.gravity import STANDARD_GRAVITY, gravity_seen
+from rs_localizer.inertial.gyro_prior import STANDARD_GRAVITY, gravity_seen
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.turning import GyroscopeErrors
 
