@@ -145,6 +145,13 @@ def _matrix(K: Any) -> Array:
     return matrix
 
 
+def _coefficients(D: Any, law: LensLaw) -> Array:
+    """Return coefficients of distortion (k,); none, or zeros where the ideal lens is no pinhole."""
+    given = np.zeros(0) if D is None else numbers("D", D).ravel()
+    ideal = len(given) == 0 and law.sphere is not None and 0 in law.counts
+    return np.zeros(law.counts[-1]) if ideal else given
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
     """A calibrated camera with its shutter.
@@ -196,7 +203,6 @@ class Camera:
     def __post_init__(self) -> None:
         set_field = object.__setattr__  # the dataclass is frozen; this is its constructor
         K = _matrix(self.K)
-        D = np.zeros(0) if self.D is None else numbers("D", self.D).ravel()
         set_field(self, "width", pixel_count("width", self.width))
         set_field(self, "height", pixel_count("height", self.height))
         if K[0, 0] <= 0.0 or K[1, 1] <= 0.0:
@@ -206,6 +212,7 @@ class Camera:
         if K[0, 1] != 0.0 or K[1, 0] != 0.0 or np.any(K[2] != (0.0, 0.0, 1.0)):
             raise ValueError(f"K must have no skew and a last row 0 0 1, got {K.tolist()}")
         model = choice("distortion_model", DistortionModel, self.distortion_model)
+        D = _coefficients(self.D, model.law)
         if len(D) not in model.law.counts:
             raise ValueError(
                 f"{model} takes {' or '.join(map(str, model.law.counts))} coefficients, "

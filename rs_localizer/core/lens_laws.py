@@ -66,7 +66,7 @@ class LensLaw(NamedTuple):
     that its ray does not lead back to counts as one without a bearing.
     """
 
-    counts: tuple[int, ...]  # of coefficients that it may have; 0: the lens is a pinhole
+    counts: tuple[int, ...]  # of coefficients that it may have; 0: all of them are zero
     # For each coefficient that calibration estimates, the lowest power of the radius by which it
     # moves points (0 for the lowest); None: it moves them along no radius. A single image may
     # correct those below the third power.

@@ -66,6 +66,15 @@ def test_rays_lead_back_to_their_pixels_by_opencv(model, D):
     np.testing.assert_allclose(back, raw, atol=1e-6)
 
 
+@pytest.mark.parametrize("D", [None, [], [0.0, 0.0, 0.0, 0.0]])
+def test_a_fisheye_without_coefficients_is_no_pinhole(D):
+    points = np.array([[1.0, 0.0, 1.0], [-0.2, 0.5, 2.0]])
+    zero, none = np.zeros(3), np.zeros(4)
+    expected = cv2.fisheye.projectPoints(points[:, None], zero, zero, K, none)[0][:, 0]
+    seen = camera(D=D, distortion_model="equidistant").project(points)
+    np.testing.assert_allclose(seen, expected, atol=1e-9)
+
+
 @pytest.mark.parametrize(("model", "D"), LENSES)
 def test_projecting_undoes_rays_also_with_binning_and_roi(model, D):
     cropped = camera(D=D, distortion_model=model, **PART)
