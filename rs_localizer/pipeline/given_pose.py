@@ -29,6 +29,7 @@ _UNSAID = (0.1, 0.05)
 # Nobody knows a pose better beforehand than it is worth: m, rad.
 _LEAST = (0.01, 0.005)
 _OLDEST = 10.0  # s
+_ROUNDING = 1e-6  # of an eigenvalue of correlations: filters compute with single precision
 # Squared distance of six numbers from what was given that one pose in ten thousand has.
 _FAR = 27.9
 
@@ -73,9 +74,15 @@ def read_given_pose(message: Any) -> GivenPose:
         raise MessageError("the covariance of the given pose holds numbers that are not finite")
     if (variances := spread.diagonal()).min() < 0.0:
         raise MessageError(f"the given pose has variances below zero: {variances.tolist()}")
+    spread = 0.5 * (spread + spread.T)
+    scale = np.sqrt(np.where(variances > 0.0, variances, 1.0))
+    if (least := np.linalg.eigvalsh(spread / np.outer(scale, scale))[0]) < -_ROUNDING:
+        raise MessageError(
+            f"the given pose has no covariance: its correlations have an eigenvalue of {least:.2g}"
+        )
     frame = message.header.frame_id.removeprefix("/")
     body = getattr(message, "child_frame_id", "").removeprefix("/")
-    return GivenPose(stamp_ns(message), frame, body, pose, 0.5 * (spread + spread.T))
+    return GivenPose(stamp_ns(message), frame, body, pose, spread)
 
 
 class PosePrior:
@@ -153,8 +160,12 @@ def _of_camera(
     jacobian[:3, 3:] = back
     jacobian[3:, :3] = back
     jacobian[3:, 3:] = -back @ so3.hat(lever)
+    spread = jacobian @ covariance @ jacobian.T
+    # Of numbers that are known to a metre and to a thousand kilometres rounding may leave none.
+    scale = np.sqrt(spread.diagonal())
+    values, vectors = np.linalg.eigh(spread / np.outer(scale, scale))
     whole = np.zeros((12, 12))
-    whole[:6, :6] = jacobian @ covariance @ jacobian.T
+    whole[:6, :6] = np.outer(scale, scale) * ((vectors * np.maximum(values, _ROUNDING)) @ vectors.T)
     readout = config.readout_time
     for i, deviation in ((6, config.velocity_prior.angular), (9, config.velocity_prior.linear)):
         variance = (deviation * readout) ** 2 if deviation > 0.0 else np.inf

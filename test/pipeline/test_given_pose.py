@@ -120,3 +120,20 @@ def test_a_click_counts_once_and_a_filter_again_and_again(body, lasts):
 def test_covariances_that_are_none_are_named(variance, fault):
     with pytest.raises(MessageError, match=fault):
         read_given_pose(given(variances=(0.25, variance, 0, 0, 0, 0.0685)))
+
+
+def test_correlations_that_are_none_are_named():
+    message = given(variances=np.ones(6))
+    message.pose.covariance[1] = message.pose.covariance[6] = 2.0
+    with pytest.raises(MessageError, match="correlations have an eigenvalue of -1"):
+        read_given_pose(message)
+
+
+@pytest.mark.parametrize("variance", [1e-12, 1.0, 1e12, 1e30])
+def test_numbers_that_a_filter_takes_for_one_are_a_prior(variance):
+    """A prior that no frame can use would cost all of them their poses."""
+    message = given()
+    message.pose.covariance[:] = variance
+    found, notices, _ = asked(message)
+    assert notices == []
+    assert found.covariance[0, 0] >= 0.9 * variance
