@@ -152,6 +152,14 @@ class _Way(NamedTuple):
     by_stamps: Array  # (3,6) the speed's, by errors of the three stamps
     noise: float  # of the speed, squared
 
+    @property
+    def jump(self) -> Array:
+        """Return the deviation (6,) of the speed of a motion that starts or stops somewhere here.
+
+        At an unknown moment, by the difference of the speeds before and after: uniformly.
+        """
+        return 0.5 * self.seconds / math.sqrt(12.0) * self.change
+
     @classmethod
     def through(cls, before: _Look, now: _Look, after: _Look) -> _Way | None:
         """Return the motion; None: noise may be all that there is."""
@@ -333,7 +341,7 @@ class ShutterWatch:
         known[_OTHERWISE, _OTHERWISE] += self._unlike * wanders
         prior = self._mean * np.repeat([1.0, _ALIKE, 1.0], [2, 12, 3])
         mean, self._covariance, speed, weights = _measured(
-            now.rows, now.off, prior, known, way.speed, way.by_stamps
+            now.rows, now.off, prior, known, way.speed, way.by_stamps, way.jump
         )
         self._mean = mean
         changed = (mean - prior)[_OTHERWISE] ** 2 / wanders.diagonal()
@@ -356,6 +364,9 @@ class ShutterWatch:
         covariance[:3, :3] += by_stamps.T @ self._covariance[_STAMPS, _STAMPS] @ by_stamps
         shorter = (self._usual * self._shorter) ** 2 * float(speed[:3] @ speed[:3])
         covariance[:3, :3] += wandering + shorter * np.eye(3)
+        jump = np.outer(self._usual * way.jump[:3], self._usual * way.jump[:3])
+        # All of the jump may be within the rows.
+        covariance += np.kron(np.diag([1.0, 12.0]), jump)
         one = RowRotation(turned, covariance, by_shutter)
         self._rotations.add(one, 2.0 * self._usual / way.seconds)
 
@@ -481,14 +492,15 @@ class ShutterWatch:
 
 @entry
 def _measured(
-    rows: Array2, off: Array1, prior: Array1, known: Array2, speed: Array1, by_stamps: Array2
-) -> tuple[Array, Array, Array, Array]:
+    rows: Array2, off: Array1, prior: Array1, known: Array2, speed: Array1, by_stamps: Array2,
+    jump: Array1,
+) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     """Return what is estimated (17,) after a frame, its covariance, speed and weights.
 
     Args:
         rows: (2 n,18) px, and errors (2 n,): of :class:`_Look`.
         prior: (17,) and its covariance, likewise.
-        speed: (6,) and its derivatives (3,6), of :class:`_Way`.
+        speed, by_stamps, jump: (6,), its derivatives (3,6) and deviation (6,), of :class:`_Way`.
     """
     mean, fitted, information = prior, np.zeros(18), np.zeros((18, 18))
     along, moved, variance = rows[:, 6:].copy(), np.zeros((12, _ESTIMATED)), 0.0
@@ -502,6 +514,9 @@ def _measured(
                 (prior[_STAMPS] - mean[_STAMPS]) @ by_stamps
             )
         expected = moved @ known @ moved.T
+        for axis in range(2):
+            of_axis = slice(6 * axis, 6 * axis + 6)
+            expected[of_axis, of_axis] += mean[axis] ** 2 * np.outer(jump, jump)
         information[6:, 6:] = np.linalg.inv(expected)
         rest = off - along @ ways
         left = off - rows @ fitted if k > 0 else rest

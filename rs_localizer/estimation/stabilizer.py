@@ -114,18 +114,21 @@ def _compared(
 def _likeness(values: Array2, weights: Array3) -> tuple[float, float]:
     """Return how alike neighbours of values (n,3) are, in deviations, and their rms.
 
-    Independent errors of neighbours leave their product as it is.
+    Independent errors of neighbours leave their product as it is. In the rms products count by
+    what is known of them: where a motion starts or stops, little is.
     """
-    pairs, square, before = 0.0, 0.0, np.zeros(3)
+    pairs, square, total, before, known_before = 0.0, 0.0, 0.0, np.zeros(3), 0.0
     for i in range(len(values)):
         factor = weights[i].copy()
+        known = math.sqrt(np.trace(factor))
         eliminate(factor, 3)
         whitened = np.triu(factor) @ values[i]
+        pairs += np.sum(whitened * before)
         if i > 0:
-            pairs += np.sum(whitened * before)
-            square += np.sum(values[i] * values[i - 1])
-        before = whitened
-    square /= max(len(values) - 1, 1)
+            square += known * known_before * np.sum(values[i] * values[i - 1])
+            total += known * known_before
+        before, known_before = whitened, known
+    square /= max(total, 1e-300)
     return pairs / math.sqrt(3.0 * len(values)), math.sqrt(max(square, 0.0))
 
 
