@@ -454,3 +454,48 @@ def test_a_track_learns_how_its_camera_vibrates(monkeypatch):
     monkeypatch.setattr("rs_localizer.tracking._REMEMBERED", 0.0)
     assert np.mean(judge(tracked, 16, 1, {}).inside("twist")) < 0.5  # without memory
     assert np.mean(learned) > 0.7
+
+
+def test_mismatches_on_a_person_who_walks_by_harm_no_frame():
+    """Some of them once had a motion that they do not determine, and no later frame a pose."""
+    rng = np.random.default_rng(11)
+    points_about, tracker = (
+        rng.uniform([-4.0, -4.0, 2.0], [4.0, 4.0, 10.0], (1500, 3)),
+        tracker_of(),
+    )
+
+    def swaying_slowly(t):
+        turn = 0.12 * np.sin(6.3 * t + np.arange(3))
+        return Rotation.from_rotvec(turn), 0.05 * np.sin(5.0 * t + np.array([2.0, 0.0, 1.0]))
+
+    camera = Moving(swaying_slowly)
+    for k, t in enumerate(times(5)):
+        points, pixels = camera.frame(t, points_about, 200, 0.5, seed=1100 + k)
+        pixels[:130] = [200.0 + 2.0 * k, 240.0] + rng.normal(size=(130, 2)) * [30.0, 60.0]
+        found = tracker.localize(10**9 + round(1e9 * t), points, pixels)
+        assert found
+        assert squared(camera.error(found, t)[:6], found.covariance) < FAR
+
+
+def test_a_head_that_turns_at_once_tells_no_other_shutter():
+    """It rests, turns by 6 rad/s within 20 ms, and rests again."""
+    starts, ramp = np.array([0.7, 1.8]), 0.02
+
+    def turned(since):
+        return np.where(since < ramp, 0.5 * np.maximum(since, 0.0) ** 2 / ramp, since - 0.5 * ramp)
+
+    def turning(t):
+        since = np.nan_to_num(t) - starts
+        angles = 6.0 * (turned(since) - turned(since - 0.4))
+        first, second = (
+            Rotation.from_rotvec(angles[:, k : k + 1] * axis)
+            for k, axis in enumerate(([0.3, 1.0, 0.1], [-0.2, -1.0, 0.1]))
+        )
+        return first * second, np.zeros((len(since), 3))
+
+    points = np.random.default_rng(0).uniform(-5.0, 5.0, (1500, 3))
+    tracker, moving = tracker_of(), Moving(turning)
+    for k, t in enumerate(times(66)):
+        found = tracker.localize(10**9 + round(1e9 * t), *moving.frame(t, points, 150, 0.5, seed=k))
+        assert found, str(found)
+    assert not tracker.shutter.measured.contradicts(READOUT)

@@ -271,6 +271,8 @@ def _own_motion(
         return None
     chosen = observations.only(np.flatnonzero(group))
     best = best_motion(chosen.packed, chosen.count, own.state, observed.terms, threshold)
+    if not np.isfinite(best.covariance).all():  # a motion that they do not determine is none
+        return None
     errors = observations.squared_errors(best.state)
     return _Group(group, best.state, errors, best.covariance)
 
