@@ -39,7 +39,7 @@ from rs_localizer.estimation.calibration import (
 )
 from rs_localizer.estimation.hypotheses import Posterior, frame_posterior
 from rs_localizer.estimation.known_rotation import coupled_turn
-from rs_localizer.estimation.left_out import LeftOut, by_chance, left_out, reordered
+from rs_localizer.estimation.left_out import BENT, LeftOut, by_chance, left_out, reordered
 from rs_localizer.estimation.moved_part import MovedParts
 from rs_localizer.estimation.points import (
     NEAREST,
@@ -81,6 +81,11 @@ _WIDEST, _LEAST_WIDER = 4.0, 1.25
 _ROUGHEST = 0.04
 # Noise is half-normal, of this part of the gate: users leave room for errors of 3.5 deviations.
 _NOISE = 0.25
+
+
+def _is_bent(found: Estimate) -> bool:
+    """Return whether errors are smooth beyond what boards of paper have."""
+    return found.model_error > BENT * found.declared_error
 
 
 class Localizer:
@@ -269,10 +274,18 @@ class Localizer:
         self, observed: Observed, prior: Prior | None, expected_share: float
     ) -> Estimate | Failure:
         # 2. Near the predicted motion, if the points agree with it (tracking).
+        tracked = None
         if prior is not None and prior.motion is not None:
             tracked = self._track(observed, prior, expected_share)
-            if tracked:
+            if tracked and not _is_bent(tracked):
                 return replace(tracked, tracked=True)
+        found = self._searched(observed)
+        # What creeps away may bend a track: a motion that leaves it out is straight.
+        if tracked and (not found or _is_bent(found)):
+            return replace(tracked, tracked=True)
+        return found
+
+    def _searched(self, observed: Observed) -> Estimate | Failure:
         # 3. A global-shutter start, then hypotheses of the solver (LO-RANSAC).
         best = self._search.find(observed)
         if not best.found:

@@ -21,7 +21,7 @@ from rs_localizer.shutter_watch import ShutterWatch
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tracking import FrameContext, Tracker
 
-from .moving import PLAIN, Moving, before, board, camera_of, recorded_hand, squared
+from .moving import PLAIN, Moving, before, board, camera_of, recorded_hand, resting, squared
 
 READOUT = PLAIN.readout_time
 CAMERA = camera_of(PLAIN)
@@ -499,3 +499,20 @@ def test_a_head_that_turns_at_once_tells_no_other_shutter():
         found = tracker.localize(10**9 + round(1e9 * t), *moving.frame(t, points, 150, 0.5, seed=k))
         assert found, str(found)
     assert not tracker.shutter.measured.contradicts(READOUT)
+
+
+def test_what_creeps_away_does_not_take_the_camera_along():
+    """Before a far wall that stays, a tenth of the points lies on a near one, and moves off."""
+    rng, tracker = np.random.default_rng(7), tracker_of()
+    far = rng.uniform(-6.0, 6.0, (600, 3)) + np.array([0.0, 0.0, 10.0])
+    near = np.column_stack([rng.uniform(-8, 8, 500), rng.uniform(-1, 1, 500), np.full(500, 4.0)])
+    still, errors = Moving(resting), []
+    for t in times(40):
+        gone = np.array([0.3 * max(t - 0.3, 0.0), 0.0, 0.0])
+        creeping = Moving(
+            lambda t, gone=gone: (Rotation.identity(len(t)), np.tile(-gone, (len(t), 1)))
+        )
+        seen = still.frame(t, far, 144, 0.5), creeping.frame(t, near, 16, 0.5)
+        found = tracker.localize(ns(t), *(np.concatenate(each) for each in zip(*seen, strict=True)))
+        errors.append(np.linalg.norm(still.error(found, t)[3:6]) if found else np.inf)
+    assert np.max(errors[-20:]) < 0.02

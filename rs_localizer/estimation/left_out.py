@@ -77,7 +77,7 @@ _EACH = 1.0
 # Smooth errors, in parts of what is declared, from which another matrix is looked for where no
 # points are left out: boards of paper have up to 10 (12 videos), a K of another size before one
 # wall 8 to 36.
-_BENT, _BENT_OFF_CENTRE = 10.0, 1.0
+BENT, _BENT_OFF_CENTRE = 10.0, 1.0
 # Deviation of a K of this very image, which errors that are smooth over it stand for. Both are as
 # probable where K is off by 0.048: the principal point of a phone is by 0.012, and of a lens of
 # which a third is missing by 0.03 (paired set).
@@ -141,7 +141,7 @@ def left_out(
         if failure is not None:
             return LeftOut(failure)
     # A principal point alone may point to another image.
-    most = _BENT_OFF_CENTRE if off_centre(observed.exposure.cameras[0]) else _BENT
+    most = _BENT_OFF_CENTRE if off_centre(observed.exposure.cameras[0]) else BENT
     bent = posterior.model_error > most * promised(posterior)
     bent |= wide or posterior.noise > EXPECTED_NOISE * threshold
     second = _own_motion(search, observed, rest, threshold) if left > _SAMPLE else None
