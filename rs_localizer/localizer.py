@@ -368,8 +368,8 @@ class Localizer:
         gate, in_frame = self._gate(observed, best.state), None
         if observed.rotation is not None:
             in_frame = coupled_turn(observed.rotation, terms is not observed.terms)
-        assumed = replace(
-            observed.assumed, may_rest=may_rest, lenses=observed.exposure.lenses, in_frame=in_frame,
+        assumed = observed.assumed._replace(
+            may_rest=may_rest, lenses=observed.exposure.lenses, in_frame=in_frame,
             noise=_NOISE * gate,
         )  # fmt: skip
         observations = observed.observations
@@ -408,7 +408,7 @@ class Localizer:
                 observed, posterior.state, 2.0 * _MAP_GATE * most, terms, gate
             ).state
             deviation = noise * self._depth(observed, state) / assumed.focal_length
-            assumed = replace(assumed, map_deviation=deviation, noise=_NOISE * gate)
+            assumed = assumed._replace(map_deviation=deviation, noise=_NOISE * gate)
             posterior = frame_posterior(observed.observations, state, terms, gate, assumed)
         if not len(vibrating.shake):
             return posterior._replace(gate=gate)

@@ -57,10 +57,11 @@ SWITCHES: dict[str, tuple[Switch, ...]] = {
     ),
     # Hypotheses.
     "typical-speeds": (
-        Switch(f"{_FRAME}:speeds_of", lambda old: lambda terms, assumed, _: old(
-            terms, assumed, True)),
+        Switch(f"{_FRAME}:speeds_of", lambda old: lambda assumed, _: old(assumed, True)),
     ),
-    "grid-over-leans": (Switch(f"{_FRAME}:over_leans", lambda old: lambda frame, mode, _: mode),),
+    "grid-over-leans": (
+        Switch(f"{_FRAME}:modes_at", lambda old: lambda *args: old(*args[:4], False, args[5])),
+    ),
     "mixture-of-steady-and-vibrating": (
         Switch(f"{_FRAME}:_mixed", lambda old: lambda given, groups: old(given, [max(
             groups, key=lambda one: np.logaddexp.reduce(one.parts.evidences))])),

@@ -96,7 +96,7 @@ def refusal(
         )
     turn = rotation_of(posterior.state)  # none, where points on a line let it run away
     finite = np.isfinite(posterior.state).all() and np.isfinite(posterior.covariance).all()
-    if not (finite and np.allclose(turn @ turn.T, np.eye(3), atol=_ROUNDED)):
+    if not (finite and np.abs(turn @ turn.T - np.eye(3)).max() < _ROUNDED):
         return Failure(
             Reason.DEGENERATE,
             f"{found} inliers leave the motion so open that it cannot be computed",

@@ -41,7 +41,7 @@ from rs_localizer.estimation.linear_fit import (
     taken_by,
 )
 from rs_localizer.estimation.points import leaning_less, plane_of
-from rs_localizer.estimation.prior import PriorTerms, offset_between
+from rs_localizer.estimation.prior import PriorTerms, offset_between, terms_at
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.robust import TINY, apply_step
 from rs_localizer.native import entry, inlined, kernel
@@ -191,6 +191,50 @@ class Mode(NamedTuple):
     noise: float  # px
     size: float  # px, of the smooth error
     freedom: float
+
+
+class Speeds(NamedTuple):
+    """Typical speeds of a camera, slowest first."""
+
+    parts: Array1  # (k,) of the configured one
+    odds: Array1  # (k,) logarithms, by all but the points
+    preferences: Array1  # (k,) logarithms of odds that count in the mean alone
+    turn_known: bool  # a rotation is known, and what it leaves of a turn goes with no speed
+
+
+@entry
+def modes_at(
+    frame: Frame, start: Array1, terms: PriorTerms, speeds: Speeds, planar: bool, far: float
+) -> tuple[Gaussians, Array]:
+    """Return the Gaussians of typical speeds near a state (24,); of a plane, over its leans.
+
+    Args:
+        far: log odds beside a better speed, beyond which no faster one is tried.
+
+    Returns:
+        those that were found, with the odds of their speeds; and (k,4) which speed, noise (px),
+        size of the smooth error (px) and degrees of freedom.
+    """
+    count, found, best = len(speeds.parts), 0, -np.inf
+    states, covariances = np.empty((count, STATE_SIZE)), np.empty((count, PARAMETERS, PARAMETERS))
+    evidences, numbers = np.empty(count), np.empty((count, 4))
+    near, linear = start, linear_at(frame, start)
+    for k in range(count):
+        known = terms_at(terms, speeds.parts[k], speeds.turn_known)
+        mode, near, linear = mode_of(frame, near, linear, known)
+        if planar and mode.evidence > -np.inf:
+            mode = over_leans(frame, mode, known)
+        evidence = mode.evidence + speeds.odds[k]
+        if evidence > -np.inf:
+            states[found], covariances[found] = mode.state, mode.covariance
+            evidences[found] = evidence
+            numbers[found] = np.array([1.0 * k, mode.noise, mode.size, mode.freedom])
+            found += 1
+        best = max(best, evidence)
+        if evidence < best - far:
+            break
+    turns = np.zeros((found, 0))
+    return Gaussians(states[:found], turns, covariances[:found], evidences[:found]), numbers[:found]
 
 
 @entry

@@ -27,10 +27,9 @@ from rs_localizer.core.state import (
 from rs_localizer.estimation.gaussian import (
     Frame,
     Gaussians,
-    linear_at,
+    Speeds,
     mixture,
-    mode_of,
-    over_leans,
+    modes_at,
     weights_of,
 )
 from rs_localizer.estimation.linear_fit import (
@@ -42,14 +41,13 @@ from rs_localizer.estimation.linear_fit import (
     Noise,
     TurnPrior,
     bend_of,
-    changed,
     fit,
     hidden,
     known_at,
     linear_of,
     moved,
     nothing_shared,
-    of_changed,
+    of_coupled,
     smooth_errors,
     under,
 )
@@ -142,15 +140,6 @@ class Posterior(NamedTuple):
         return left / (left - 5.0)
 
 
-class MotionHypothesis(NamedTuple):
-    """A motion that a camera may have."""
-
-    speed: float  # part of the configured one
-    terms: PriorTerms  # of its motion
-    odds: float  # logarithm, by all but the points
-    preference: float  # logarithm of odds that count in the mean alone
-
-
 class _Given(NamedTuple):
     """The points of a frame, what is known of it, and its best motion."""
 
@@ -208,18 +197,18 @@ def frame_posterior(
     declares, best = assumed.map_deviation > 0.0, given.best
     planar, _, _ = plane_of(observations.points, best.inliers)
     is_clear = not (declares or planar) and _clearly_moving(given)
-    hypotheses = speeds_of(terms, assumed, is_clear)
-    steady = _steady(given, hypotheses, planar)
+    speeds = speeds_of(assumed, is_clear)
+    steady = _steady(given, speeds, planar)
     if steady is None:
         return best._replace(smallest_eigenvalue=0.0)
     groups = [steady]
     if assumed.rolling and assumed.in_frame is not None:
-        turning = _vibrating(given, hypotheses, steady.posterior, assumed.in_frame.rest)
+        turning = _vibrating(given, speeds, steady.posterior, assumed.in_frame.rest)
         if turning is not None:  # it knows no leans
             groups = [steady, turning] if planar else [turning]
     elif assumed.rolling and not (declares and planar):
         # Apparent vibration before a bent board is more of its bend.
-        groups = _with_turn(given, hypotheses, steady, _ASKS_OF_PLANE if planar else _ASKS)
+        groups = _with_turn(given, speeds, steady, _ASKS_OF_PLANE if planar else _ASKS)
     return _mixed(given, groups)
 
 
@@ -252,54 +241,36 @@ def _given(
     )  # fmt: skip
 
 
-def speeds_of(terms: PriorTerms, assumed: Assumed, is_clear: bool) -> list[MotionHypothesis]:
-    """Return typical speeds of a camera, slowest first; if motion is clear, the configured one."""
-    turn = assumed.turn
-    return [
-        MotionHypothesis(
-            speed,
-            terms if speed == 1.0 else terms_at(terms, speed, turn is not None),
-            (assumed.of_rest if speed == 0.0 else 0.0) + (turn.evidence(speed) if turn else 0.0),
-            REST_ODDS if speed == 0.0 else 0.0,
-        )
-        for speed in SPEEDS
-        if speed == 1.0 or (assumed.may_rest and not is_clear)
-    ]
+def speeds_of(assumed: Assumed, is_clear: bool) -> Speeds:
+    """Return typical speeds of a camera; if motion is clear, the configured one."""
+    turn, every = assumed.turn, assumed.may_rest and not is_clear
+    parts = np.array(SPEEDS if every else SPEEDS[-1:])
+    rests = parts == 0.0
+    odds = np.where(rests, assumed.of_rest, 0.0)
+    if turn is not None:
+        odds += turn.evidence(parts)
+    return Speeds(parts, odds, np.where(rests, REST_ODDS, 0.0), turn is not None)
 
 
-def _steady(given: _Given, hypotheses: list[MotionHypothesis], planar: bool) -> _Camera | None:
-    """Return the Gaussians of a camera without in-frame rotation, of hypotheses that may be."""
-    frame, near, kept, best = given.frame, given.best.state, [], -math.inf
-    if len(hypotheses) > 1:
+def _steady(given: _Given, speeds: Speeds, planar: bool) -> _Camera | None:
+    """Return the Gaussians of a camera without in-frame rotation, of speeds that may be."""
+    near, count = given.best.state, len(speeds.parts)
+    if count > 1:
         near = np.concatenate([near[:POSE_SIZE], np.zeros(len(near) - POSE_SIZE)])
-    linear = linear_at(frame, near)
-    for one in hypotheses:
-        mode, near, linear = mode_of(frame, near, linear, one.terms)
-        if planar and mode.evidence > -math.inf:
-            mode = over_leans(frame, mode, one.terms)
-        evidence = mode.evidence + one.odds
-        if evidence > -math.inf:
-            kept.append((mode, one.speed, one.preference, evidence))
-        best = max(best, evidence)
-        if evidence < best - _FAR_LESS_PROBABLE / TEMPER:
-            break
-    if not kept:
+    parts, numbers = modes_at(
+        given.frame, near, given.terms, speeds, planar, _FAR_LESS_PROBABLE / TEMPER
+    )
+    if not len(numbers):
         return None
-    modes, speeds, *others = zip(*kept, strict=True)
-    preferences, evidences = map(np.array, others)
-    evidences = evidences - _of_outliers(given, given.best.inliers)
-    parts = Gaussians(
-        np.array([mode.state for mode in modes]), np.zeros((len(modes), 0)),
-        np.array([mode.covariance for mode in modes]), evidences,
-    )  # fmt: skip
-    likely = modes[int((evidences + preferences).argmax())]
-    possible = weights_of(TEMPER * evidences)
-    shared = math.sqrt(possible @ np.square([mode.size for mode in modes]))
-    of_speeds = np.zeros(len(SPEEDS))
-    of_speeds[[SPEEDS.index(speed) for speed in speeds]] = possible
+    parts.evidences[:] -= _of_outliers(given, given.best.inliers)
+    place, possible = numbers[:, 0].astype(np.int64), weights_of(TEMPER * parts.evidences)
+    preferences = speeds.preferences[place]
+    _, noise, _, freedom = numbers[(parts.evidences + preferences).argmax()].tolist()
+    shared, of_speeds = math.sqrt(possible @ numbers[:, 2] ** 2), np.zeros(len(SPEEDS))
+    of_speeds[len(SPEEDS) - count + place] = possible
     posterior = given.best._replace(
-        noise=likely.noise, freedom=likely.freedom, model_error=shared, shared=shared,
-        bend=given.bend, speeds=of_speeds, squared_errors=np.zeros(0),
+        noise=noise, freedom=freedom, model_error=shared, shared=shared, bend=given.bend,
+        speeds=of_speeds, squared_errors=np.zeros(0),
     )  # fmt: skip
     return _Camera(parts, preferences + STEADY_ODDS, posterior)
 
@@ -310,22 +281,19 @@ def _of_outliers(given: _Given, inliers: BoolArray) -> float:
     return 2.0 * outside * math.log(given.assumed.focal_length)
 
 
-def _with_turn(
-    given: _Given, hypotheses: list[MotionHypothesis], steady: _Camera, asks: float
-) -> list[_Camera]:
+def _with_turn(given: _Given, speeds: Speeds, steady: _Camera, asks: float) -> list[_Camera]:
     """Return hypotheses without in-frame rotation, and with it if its evidence is what it asks."""
-    odds, before = VIBRATION.odds, given.assumed.of_vibration
+    prior, expected, before = VIBRATION, 0.0, given.assumed.of_vibration
     if before.size:
-        odds = odds + before
-    expected = float(np.logaddexp.reduce(odds))
-    prior = VIBRATION._replace(odds=odds - expected)
+        expected = float(np.logaddexp.reduce(prior.odds + before))
+        prior = prior._replace(odds=prior.odds + before - expected)
     motion, known = steady.posterior, known_at(given.terms, given.best.state)
     gain, undetected, vibrations = hidden(
         given.lines, given.best.inliers, given.frame.shared.at(motion.shared), known,
         motion.noise, motion.freedom, given.assumed.noise, prior,
     )  # fmt: skip
     gain, posterior = gain + expected, steady.posterior._replace(vibrations=vibrations)
-    vibrating = _vibrating(given, hypotheses, posterior, prior) if gain > asks else None
+    vibrating = _vibrating(given, speeds, posterior, prior) if gain > asks else None
     if vibrating is None:
         weight = 1.0 / (1.0 + math.exp(min(_HIDDEN_ODDS - TEMPER * gain, 700.0)))
         return [steady._replace(posterior=posterior._replace(undetected=weight * undetected))]
@@ -370,14 +338,14 @@ def _at(given: _Given, state: Array, turn: Array, gate: float) -> _Turning:
 
 
 def _vibrating(
-    given: _Given, hypotheses: list[MotionHypothesis], steady: Posterior, prior: TurnPrior
+    given: _Given, speeds: Speeds, steady: Posterior, prior: TurnPrior
 ) -> _Camera | None:
     """Return hypotheses with in-frame rotation, if such a fit converges to as many points."""
     best, threshold, in_frame = given.best, given.threshold, given.assumed.in_frame
     lens = given.observations.lens_of(given.assumed.lenses)
     noise, fewest = best.noise, max(_KEPT * np.count_nonzero(best.inliers), _FEWEST_TURNING)
     # Near a rotation that is known the frame is more linear.
-    short = _SHORT if in_frame is None else 1.0
+    short, by_motion = (_SHORT, None) if in_frame is None else (1.0, in_frame.by_motion)
     state, turn, is_last = best.state, np.zeros(TURNS), False
     for k in range(_STEPS):
         gate = min(max(threshold, GATE * noise), WIDEST_GATE * threshold)
@@ -393,13 +361,10 @@ def _vibrating(
         first = np.concatenate([np.zeros(POSE.stop), -still[POSE_SIZE:], -now.turn])
         still = apply_step(still, first[:PARAMETERS])
         linear = linear_of(now.lines, now.inliers, True, shared.rows)
-        if in_frame is None:
-            linear = moved(linear, first)
-        else:
-            by = in_frame.coupling(step_between(given.terms.references[-1].copy(), still))
-            coupled = by.copy()
-            coupled[:-1, -1] += first
-            linear = changed(linear, coupled)
+        if by_motion is not None:
+            offset = step_between(given.terms.references[-1].copy(), still)
+            first[PARAMETERS:] += by_motion @ offset
+        linear = moved(linear, first, by_motion)
         known, is_last = known_at(given.terms, still), is_last or k == _STEPS - 1
         seen = Noise(noise, 1.0, float(PARAMETERS), given.assumed.noise)
         if in_frame is not None and k == 0:  # the second step would change the noise alone
@@ -408,8 +373,8 @@ def _vibrating(
             seen = seen._replace(deviation=noise)
         finely = is_last or in_frame is not None
         found = fit(linear, shared, known, seen, prior, finely)
-        if in_frame is not None:
-            found = of_changed(found, by)
+        if by_motion is not None:
+            found = of_coupled(found, by_motion)
         step = first + found.step
         state, turn = now.after(step)
         if not (found.evidence > -math.inf and np.isfinite(state).all()):
@@ -420,18 +385,18 @@ def _vibrating(
         noise, is_last = max(found.noise, LEAST_NOISE), farthest < short
     if not (farthest < 1.0 and np.count_nonzero(now.inliers) >= fewest):
         return None
-    fits = [under(found, known, known_at(one.terms, still)) for one in hypotheses]
+    priors = [terms_at(given.terms, part, speeds.turn_known) for part in speeds.parts.tolist()]
+    fits = [under(found, known, known_at(one, still)) for one in priors]
     states, turns = map(np.array, zip(*(now.after(first + one.step) for one in fits), strict=True))
     parts = Gaussians(
         states, turns, np.array([_with_middle(one.covariance) for one in fits]),
-        np.array([one.evidence for one in fits]) + [one.odds for one in hypotheses]
-        - _of_outliers(given, now.inliers),
+        np.array([one.evidence for one in fits]) + speeds.odds - _of_outliers(given, now.inliers),
     )  # fmt: skip
     posterior = steady._replace(
         noise=found.noise, freedom=found.freedom, inliers=now.inliers, speeds=np.zeros(0),
         squared_errors=_at(given, state, turn, math.inf).squares, shared=given.size,
     )  # fmt: skip
-    return _Camera(parts, np.array([one.preference for one in hypotheses]), posterior)
+    return _Camera(parts, speeds.preferences, posterior)
 
 
 def _mixed(given: _Given, groups: list[_Camera]) -> Posterior:

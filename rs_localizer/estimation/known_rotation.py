@@ -29,7 +29,7 @@ from rs_localizer.estimation.linear_fit import (
     TurnPrior,
 )
 from rs_localizer.estimation.prior import Prior
-from rs_localizer.estimation.robust import inverted
+from rs_localizer.estimation.robust import inverse_of
 from rs_localizer.estimation.window import MotionSample
 
 # Sizes of vibration that the other knowledge misses, over ordinary ones; none at first. Without the
@@ -47,16 +47,6 @@ class CoupledTurn(NamedTuple):
     by_motion: Array  # (54,18)
     rest: TurnPrior
 
-    def coupling(self, offset: Array) -> Array:
-        """Return motion and turn (73,73) by the motion and the rest, where the motion is off (18,).
-
-        As :func:`.linear_fit.changed` takes it.
-        """
-        by = np.eye(WHOLE + 1)
-        by[PARAMETERS:WHOLE, :PARAMETERS] = self.by_motion
-        by[PARAMETERS:WHOLE, WHOLE] = self.by_motion @ offset
-        return by
-
 
 def coupled_turn(rotation: RotationPrior, predicted: bool) -> CoupledTurn:
     """Return the prior of the in-frame turn.
@@ -72,10 +62,10 @@ def coupled_turn(rotation: RotationPrior, predicted: bool) -> CoupledTurn:
     by_motion[:, place] = by_scaled / scale
     rest = rotation.covariance[turn, turn] - by_motion[:, place] @ across.T
     each = [rest + (_LEAST**2 + missed**2) * np.eye(TURNS) for missed in _MISSED]
-    informations = np.array([inverted(one) for one in each])
+    informations, volumes = map(np.array, zip(*map(inverse_of, each), strict=True))
     odds = np.full(len(each), math.log((1.0 - _COMPLETE) / (len(each) - 1)))
     odds[0] = math.log(_COMPLETE)
-    return CoupledTurn(by_motion, TurnPrior.of(informations, odds))
+    return CoupledTurn(by_motion, TurnPrior(informations, -volumes, odds))
 
 
 def whole_covariance(covariance: Array) -> Array:

@@ -37,6 +37,7 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 
 from rs_localizer.core.arrays import Array, Array1, Array2, Array3, BoolArray, BoolArray1, IntArray
+from rs_localizer.core.blocks import write
 from rs_localizer.core.shake import (
     COMBINATIONS,
     CYCLES,
@@ -61,8 +62,6 @@ BLOCKS: dict[str, slice] = {
     "turn": slice(PARAMETERS, PARAMETERS + TURNS),
 }
 """Places of the unknowns, by name."""
-SHARED = "shared"
-"""The name of the errors that points share, which are noise and no unknowns."""
 MIDDLE = np.zeros((PARAMETERS, TURNS))
 """How the coefficients of the in-frame turn turn the middle row, and how fast."""
 _VALUES, _RATES = MIDDLE_VALUES @ COMBINATIONS, MIDDLE_RATES @ COMBINATIONS
@@ -421,36 +420,28 @@ def linear_of(lines: Lines, chosen: BoolArray1, turns: bool, rows: Array2) -> Li
     return Linear(every.copy(), beside.copy())
 
 
-def changed(linear: Linear, by: Array) -> Linear:
-    """Return the system of other unknowns: the present ones, and 1, are ``by`` (p+1,r+1) these."""
-    return Linear(by.T @ linear.every @ by, linear.beside @ by)
+def moved(linear: Linear, step: Array, by_motion: Array | None = None) -> Linear:
+    """Return the system at a point that lies so far (p,) along the tangent.
+
+    Args:
+        by_motion: (54,18) turn that goes with the motion, beside which the unknown one is; None:
+            there is none.
+    """
+    every, beside = linear.every.copy(), linear.beside.copy()
+    for columns in (every, every.T, beside):
+        columns[:, -1] += columns[:, :-1] @ step
+        if by_motion is not None:
+            columns[:, :PARAMETERS] += columns[:, PARAMETERS:-1] @ by_motion
+    return Linear(every, beside)
 
 
-def of_changed(fit: LinearFit, by: Array) -> LinearFit:
-    """Return the fit of the unknowns that are ``by`` (p+1,p+1) those that were fitted, and 1."""
-    step, every = by[:-1] @ np.append(fit.step, 1.0), by[:-1, :-1]
-    return fit._replace(step=step, covariance=every @ fit.covariance @ every.T)
-
-
-def without(linear: Linear, name: str) -> Linear:
-    """Return the system without a block of unknowns, or without shared errors."""
-    if name == SHARED:
-        return linear._replace(beside=np.zeros_like(linear.beside[:1]))
-    kept = np.delete(np.arange(len(linear.every)), BLOCKS[name])
-    return Linear(linear.every[kept][:, kept].copy(), linear.beside[:, kept].copy())
-
-
-def moved(linear: Linear, step: Array) -> Linear:
-    """Return the system at a point that lies so far (p,) along the tangent."""
-    by = np.eye(len(step) + 1)
-    by[:-1, -1] = step
-    return changed(linear, by)
-
-
-def marginal(fit: LinearFit, name: str) -> tuple[Array, Array]:
-    """Return mean and covariance of a block of unknowns."""
-    place = BLOCKS[name]
-    return fit.step[place], fit.covariance[place, place]
+def of_coupled(fit: LinearFit, by_motion: Array) -> LinearFit:
+    """Return the fit of the whole turn, by one of the turn beside what goes with the motion."""
+    step, covariance = fit.step.copy(), fit.covariance.copy()
+    step[PARAMETERS:] += by_motion @ step[:PARAMETERS]
+    covariance[PARAMETERS:] += by_motion @ covariance[:PARAMETERS]
+    covariance[:, PARAMETERS:] += covariance[:, :PARAMETERS] @ by_motion.T
+    return fit._replace(step=step, covariance=covariance)
 
 
 @entry
@@ -515,8 +506,8 @@ def _without_motion(
     """
     scaled, size, held = linear.beside.copy(), len(linear.every) - 1, len(known.form) - 1
     for k in range(len(taken)):
-        scaled[k] *= taken[k]
-    whole = (linear.every - scaled.T @ linear.beside) / variance
+        scaled[k] *= math.sqrt(taken[k])
+    whole = (linear.every - scaled.T @ scaled) / variance  # half the work of two matrices
     whole[:held, :held] += known.form[:held, :held]
     whole[:held, size] += known.form[:held, held]
     whole[size, size] += known.form[held, held]
@@ -617,18 +608,21 @@ def _over_turns(
             if prior.odds[k] == -np.inf:
                 continue
             whole = wholes[k % len(wholes)]
-            whole[:] = equations[:size]
-            whole[:, :size] += prior.informations[k]
+            for i in range(size):
+                row, own, more = whole[i, i:], equations[i, i:], prior.informations[k, i, i:]
+                for j in range(len(more)):
+                    row[j] = own[j] + more[j]
+                write(whole[i, size:], equations[i, size:])
             eliminate(whole, size)
+            half, volume = whole[:, size:].copy(), prior.volumes[k]
+            both = half.T @ half
             if combines:
-                half = whole[:, rows:].copy()
-                means[k], moments[k] = whole[:, size].copy() @ half, half.T @ half
+                means[k], moments[k] = both[0, 1:], both[1:, 1:]
             else:
                 back(whole, means[k])
-            volume = prior.volumes[k]
             for i in range(size):
                 volume -= math.log(whole[i, i])
-            left[k] = max(1.0 - np.sum(whole[:, size] ** 2) / rest, _LEAST_LEFT)
+            left[k] = max(1.0 - both[0, 0] / rest, _LEAST_LEFT)
             weights[k] = prior.odds[k] + volume - 0.5 * freedom * math.log(left[k])
             weights[k] += noisy * (1.0 - left[k])
             best = max(best, weights[k])

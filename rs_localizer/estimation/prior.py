@@ -439,14 +439,14 @@ class TurnSeen(NamedTuple):
     variance: float  # of each axis, if the camera is at rest
     typical_variance: float  # of each axis, by the prior of the motion
 
-    def evidence(self, speed: float) -> float:
-        """Return the log likelihood of a typical speed, up to a constant."""
-        variance = self.variance + speed**2 * self.typical_variance
-        return -0.5 * (self.squared_rate / variance + 3.0 * math.log(variance))
+    def evidence(self, speeds: Array) -> Array:
+        """Return the log likelihoods of typical speeds (k,), up to a constant."""
+        variances = self.variance + speeds**2 * self.typical_variance
+        evidences: Array = -0.5 * (self.squared_rate / variances + 3.0 * np.log(variances))
+        return evidences
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Assumed:
+class Assumed(NamedTuple):
     """Assumptions on a camera and its map, beside the prior of the motion."""
 
     map_deviation: float  # m
@@ -455,7 +455,7 @@ class Assumed:
     rolling: bool  # velocities are estimated
     lenses: IntArray | None = None  # (k,) camera of each side of a rig; None: one camera
     of_rest: float = 0.0  # logarithm of the odds for rest, beside those of any camera
-    of_vibration: Array = field(default_factory=np.zeros(0).copy)  # see Prior
+    of_vibration: Array = np.zeros(0)  # see Prior
     noise: float = math.inf  # px, of its half-normal prior
     turn: TurnSeen | None = None  # by a rotation prior
     in_frame: CoupledTurn | None = None  # likewise
@@ -493,12 +493,12 @@ def of_frame(
 ) -> tuple[PriorTerms, Assumed]:
     """Add what is known of this frame: its rotation, rest, vibration, and measurements."""
     if rotation is not None:
-        assumed = replace(assumed, turn=turn_seen(terms, rotation))
+        assumed = assumed._replace(turn=turn_seen(terms, rotation))
         informations = terms.informations.copy()
         informations[0][_TURNING] = np.linalg.inv(rotation.error)
         terms = terms._replace(informations=informations)
     if prior is not None:
-        assumed = replace(assumed, of_rest=prior.of_rest, of_vibration=prior.of_vibration)
+        assumed = assumed._replace(of_rest=prior.of_rest, of_vibration=prior.of_vibration)
         terms = with_measurements(terms, prior)
     return terms, assumed
 
@@ -511,7 +511,7 @@ def beside(prior: Prior, rotation: RotationPrior) -> Prior:
     covariance[turning] = covariance[:, turning] = 0.0
     covariance[np.ix_(turning, turning)] = rotation.error
     still = replace(prior.motion, angular_velocity=np.zeros(3), angular_acceleration=np.zeros(3))
-    return replace(prior, motion=still, covariance=covariance)
+    return unchecked(prior, motion=still, covariance=covariance)
 
 
 def turn_seen(terms: PriorTerms, rotation: RotationPrior) -> TurnSeen:

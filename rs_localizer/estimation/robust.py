@@ -156,7 +156,7 @@ def inverted(matrix: Array2) -> Array:
     return inverse_of(matrix)[0]
 
 
-@kernel
+@entry
 def inverse_of(matrix: Array2) -> tuple[Array, float]:
     """Return the inverse, and half the logarithm of the determinant; NaN as of `inverted`."""
     factor, volume = matrix.copy(), 0.0
