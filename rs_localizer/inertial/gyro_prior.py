@@ -44,6 +44,7 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.known_rotation import LastFrame, whole_covariance
 from rs_localizer.estimation.linear_fit import MIDDLE
 from rs_localizer.estimation.prior import Prior, predicted, state_in
+from rs_localizer.estimation.robust import inverted
 from rs_localizer.estimation.window import MotionSample, numbers_by_name
 from rs_localizer.inertial.oddities import LEANING, ComparedTurns, told_by_numbers
 from rs_localizer.inertial.samples import ImuSamples
@@ -273,7 +274,8 @@ class GyroscopeTrack:
         by_told[:PARAMETERS] -= MIDDLE_POSE @ by_told[PARAMETERS:]
         by_errors = by_told @ found.by_errors
         known, tied, motions = self.errors.covariance, self._tied, slice(0, PARAMETERS)
-        if not _is_positive(np.block([[last.covariance, tied], [tied.T, known]])):
+        joint = np.hstack([np.vstack([last.covariance, tied.T]), np.vstack([tied, known])])
+        if np.isnan(inverted(joint)[0, 0]):
             tied = np.zeros_like(tied)
         tied = np.concatenate([transport @ tied, np.zeros((WHOLE - PARAMETERS, ERRORS))])
         crossed = tied @ by_errors.T
@@ -328,11 +330,12 @@ class GyroscopeTrack:
                 self._former = self.errors
                 self._begin()
         # What was contradicted often agrees by chance where the camera hardly turns.
-        reason = ImuReason.DISAGREES if self.contradicted else ImuReason.DOUBTED
-        is_used = agrees and not self.contradicted
-        said = self._oddity() or "the camera and the gyroscope turn differently"
-        self._unused = None if is_used else Unused(reason, said)
-        return is_used
+        contradicted, self._unused = self.contradicted, None
+        if contradicted or not agrees:
+            said = self._oddity() or "the camera and the gyroscope turn differently"
+            reason = ImuReason.DISAGREES if contradicted else ImuReason.DOUBTED
+            self._unused = Unused(reason, said)
+        return self._unused is None
 
     @property
     def contradicted(self) -> bool:
@@ -395,12 +398,3 @@ def gravity_seen(
     strange = math.hypot(length - STANDARD_GRAVITY, scatter) / STANDARD_GRAVITY
     deviation = math.hypot(_LEAST_LEAN, strange)
     return None if deviation > _MOST_LEAN else (-force / length, deviation)
-
-
-def _is_positive(joint: Array) -> bool:
-    scale = np.sqrt(joint.diagonal())
-    try:
-        np.linalg.cholesky(joint / np.outer(scale, scale))
-    except np.linalg.LinAlgError:
-        return False
-    return True

@@ -276,7 +276,8 @@ def read(
     within = readout_time * errors.derivatives(usual / readout_time)
     by_errors[WITHIN] += (_PARTS @ within.reshape(len(usual), -1)).reshape(-1, PARAMETERS)
     spread = _PARTS @ (readout_time**2 * spread) @ _PARTS.T
-    rest[WITHIN, WITHIN] += np.kron(spread, np.eye(3))
+    for axis in range(3):
+        rest[WITHIN, WITHIN][axis::3, axis::3] += spread
     between = None
     if length != 0.0:
         between = np.ascontiguousarray(turns[-1].T)
