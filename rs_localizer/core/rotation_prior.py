@@ -31,6 +31,7 @@ WHOLE = PARAMETERS + 3 * RESOLVED
 """Numbers of a motion and of an in-frame turn."""
 ROTATION = np.r_[ANGULAR, ANGULAR_ACCELERATION, PARAMETERS:WHOLE]
 """Places of the numbers of a rotation among those of motion and in-frame turn."""
+_RATES = np.ix_(ROTATION[:6], ROTATION[:6])
 
 NODES = np.linspace(-0.52, 0.52, 53)
 """Row times at which rotations are compared."""
@@ -77,8 +78,7 @@ class RotationPrior:
     @property
     def error(self) -> Array:
         """(6,6) covariance of rate and change."""
-        six = ROTATION[:6]
-        return self.covariance[np.ix_(six, six)]
+        return self.covariance[_RATES]
 
     def at_rows(self, tau: Array) -> tuple[Array, Array]:
         """Return rotations (n,3,3) camera_then_from_camera_at_tau_0 and body rates (n,3)."""

@@ -242,7 +242,7 @@ def linear_at(frame: Frame, state: Array1) -> Linear:
     """Return the products at a state (24,) without an in-frame rotation."""
     count = len(frame.chosen)
     lines = linearized(frame.data, count, state, np.zeros((count, 6)))
-    return linear_of(lines, frame.chosen, False, frame.shared.rows)
+    return linear_of(lines, frame.chosen, False, frame.shared)
 
 
 @entry

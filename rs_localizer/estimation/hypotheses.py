@@ -360,7 +360,7 @@ def _vibrating(
         # rounding would show.
         first = np.concatenate([np.zeros(POSE.stop), -still[POSE_SIZE:], -now.turn])
         still = apply_step(still, first[:PARAMETERS])
-        linear = linear_of(now.lines, now.inliers, True, shared.rows)
+        linear = linear_of(now.lines, now.inliers, True, shared)
         if by_motion is not None:
             offset = step_between(given.terms.references[-1].copy(), still)
             first[PARAMETERS:] += by_motion @ offset

@@ -182,7 +182,9 @@ NO_TURN = TurnPrior(np.zeros((0, TURNS, TURNS)), np.zeros(0), np.zeros(0))
 class Shared(NamedTuple):
     """Columns of errors that the chosen points share, and what is known of their size."""
 
-    rows: Array2  # (2m,q) orthonormal combinations of the columns
+    # (2,m,q) orthonormal combinations of the columns, of u and of v; (2,m,q/2): first those of u
+    # alone, then those of v alone
+    rows: Array3
     squares: Array1  # (q,) of the columns' lengths, for a size of 1 px
     sizes: Array1  # (s,) px, root mean squares that are weighed
     odds: Array1  # (s,) logarithms of their probabilities
@@ -205,12 +207,8 @@ def smooth_columns(by_motion: Array3, rays: Array2, bend: Array2) -> Array:
     if bend.shape[1] > 0:
         bent = np.empty((count, 2, 3 * bend.shape[1]))
         for i in range(count):
-            for side in range(2):
-                for k in range(bend.shape[1]):
-                    for axis in range(3):
-                        bent[i, side, 3 * k + axis] = (
-                            -by_motion[i, side, MOVE.start + axis] * bend[i, k]
-                        )
+            for k in range(bend.shape[1]):
+                bent[i, :, 3 * k : 3 * k + 3] = -bend[i, k] * by_motion[i, :, MOVE]
         return bent
     columns = np.zeros((count, 2, 2 * TERMS))
     places, powers = _places_of(by_motion, rays), np.ones((3, DEGREE + 1))
@@ -293,11 +291,12 @@ def smooth_error(lines: Lines, chosen: BoolArray1, bend: Array2, size: float) ->
     values, axes = np.linalg.eigh(flat.T @ flat)
     kept = np.flatnonzero(values > _LEAST_SQUARE * max(values[-1], 1e-300))
     squares = values[kept]
-    rows = flat @ np.ascontiguousarray(axes[:, kept]) / np.sqrt(squares)
+    combined = flat @ np.ascontiguousarray(axes[:, kept]) / np.sqrt(squares)
+    rows = np.empty((2, len(columns), len(squares)))
+    for side in range(2):
+        rows[side] = combined if of_image else combined[side::2]
     if of_image:
-        each, rows = rows, np.zeros((2 * len(rows), 2 * len(squares)))
-        rows[::2, ::2] = rows[1::2, 1::2] = each
-        squares = np.repeat(squares, 2)
+        squares = np.append(squares, squares)
     return Shared(rows, squares, size * np.exp(_SIZES), _ODDS.copy())
 
 
@@ -338,13 +337,13 @@ def smooth_errors(
         kept = values > _LEAST_SQUARE * max(values.max(initial=0.0), TINY)
         rows.append(flat @ axes[:, kept] / np.sqrt(values[kept]))
         squares.append(values[kept])
-    found = np.concatenate(rows, axis=1), np.concatenate(squares)
-    return Shared(*found, size * np.exp(_SIZES), _ODDS.copy())
+    by_side = np.concatenate(rows, axis=1).reshape(len(lens), 2, -1).swapaxes(0, 1).copy()
+    return Shared(by_side, np.concatenate(squares), size * np.exp(_SIZES), _ODDS.copy())
 
 
 def nothing_shared(count: int) -> Shared:
     """Return the shared errors of so many points if there are none."""
-    return Shared(np.zeros((2 * count, 1)), np.zeros(1), np.zeros(1), np.zeros(1))
+    return Shared(np.zeros((2, count, 1)), np.zeros(1), np.zeros(1), np.zeros(1))
 
 
 class Linear(NamedTuple):
@@ -385,15 +384,15 @@ class LinearFit(NamedTuple):
 
 
 @entry
-def linear_of(lines: Lines, chosen: BoolArray1, turns: bool, rows: Array2) -> Linear:
+def linear_of(lines: Lines, chosen: BoolArray1, turns: bool, shared: Shared) -> Linear:
     """Return the products of the chosen points at a motion with in-frame rotation.
 
     Args:
         turns: with the block of the in-frame turn.
-        rows: (2m,q) of what points share.
+        shared: what these points share.
     """
     size, picked = PARAMETERS + (TURNS if turns else 0), np.flatnonzero(chosen)
-    every, beside = np.zeros((size + 1, size + 1)), np.zeros((rows.shape[1], size + 1))
+    every, beside = np.zeros((size + 1, size + 1)), np.zeros((len(shared.squares), size + 1))
     columns = np.empty((2 * min(_PART, len(picked)), size + 1))
     values, rates = np.zeros((_PART, FUNCTIONS)), np.empty(FUNCTIONS)
     for first in range(0, len(picked), _PART):  # whose columns stay in the processor's cache
@@ -401,11 +400,11 @@ def linear_of(lines: Lines, chosen: BoolArray1, turns: bool, rows: Array2) -> Li
         if turns:
             for i in range(len(some)):
                 shake_basis(lines.tau[some[i]], values[i], rates)
-        each, part = values @ COMBINATIONS, columns[: 2 * len(some)]
+        each, part, last = values @ COMBINATIONS, columns[: 2 * len(some)], first + len(some)
         for i in range(len(some)):
-            for side in range(2):
+            for side in range(2):  # all rows of u, then those of v
                 motion = lines.by_motion[some[i], side]
-                row, by_turn = part[2 * i + side], lines.by_turn[some[i], side]
+                row, by_turn = part[len(some) * side + i], lines.by_turn[some[i], side]
                 row[:PARAMETERS], row[size] = motion, lines.errors[some[i], side]
                 for axis in range(3 if turns else 0):  # behind each other, as vectors want it
                     value, rate, swing = motion[axis], motion[6 + axis], by_turn[axis]
@@ -413,7 +412,10 @@ def linear_of(lines: Lines, chosen: BoolArray1, turns: bool, rows: Array2) -> Li
                     for j in range(RESOLVED):
                         place[j] = each[i, j] * swing + _VALUES[j] * value + _RATES[j] * rate
         every += part.T @ part
-        beside += rows[2 * first : 2 * (first + len(some))].T @ part
+        for side in range(2):
+            rows, own = shared.rows[side], part[len(some) * side : len(some) * (side + 1)]
+            place = side * (len(beside) - rows.shape[1])
+            beside[place : place + rows.shape[1]] += rows[first:last].T @ own
     if turns:
         order = _BY_COMBINATION
         every, beside = every[order][:, order], beside[:, order]
@@ -530,7 +532,7 @@ def _at_size(
     The motion is taken out, then the in-frame turn of each size.
     """
     taken, variance = taken_by(shared.squares, shared.sizes[place], deviation), deviation**2
-    size, equations, m = len(linear.every) - 1, len(shared.rows), PARAMETERS
+    size, equations, m = len(linear.every) - 1, 2 * shared.rows.shape[1], PARAMETERS
     whole, half, positive = _without_motion(linear, taken, variance, known)
     step, covariance = np.zeros(size), np.zeros((size, size))
     step[:m], covariance[:m, :m] = -(half.T @ whole[:m, size].copy()), half.T @ half
@@ -728,7 +730,7 @@ def hidden(
     m, size, place = PARAMETERS, PARAMETERS + TURNS, MOTION_PARAMETERS
     deviation = max(deviation, LEAST_NOISE)
     taken, variance = taken_by(shared.squares, shared.sizes[0], deviation), deviation**2
-    linear = linear_of(lines, chosen, True, shared.rows)
+    linear = linear_of(lines, chosen, True, shared)
     whole, half, positive = _without_motion(linear, taken, variance, known)
     # What is told of the turn is how it moves pose and velocities, beside the motion with none.
     equations = np.zeros((TURNS + 1, TURNS + 1 + place))
@@ -736,7 +738,7 @@ def hidden(
     equations[:TURNS, TURNS + 1 :] = (
         MIDDLE[:place] - half[:, :place].T.copy() @ whole[:m, m:size].copy()
     ).T
-    freedom = max(freedom, _LEAST_FREEDOM * len(shared.rows), 1.0)
+    freedom = max(freedom, _LEAST_FREEDOM * 2.0 * shared.rows.shape[1], 1.0)
     move, moments, gain, _, weights = _over_turns(
         equations, freedom, prior, 0.5 * variance / expected**2, True
     )

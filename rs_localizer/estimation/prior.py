@@ -83,18 +83,27 @@ def check_covariance(covariance: Array) -> None:
     """
     if covariance.shape not in ((MOTION_PARAMETERS,) * 2, (PARAMETERS,) * 2):
         raise ValueError(f"covariance must be (12,12) or (18,18), got {covariance.shape}")
-    known = ~np.isinf(np.diagonal(covariance))
-    block = covariance[known][:, known]
-    if not np.isfinite(block).all():
-        raise ValueError("covariance must be finite where its diagonal is")
-    scale = np.sqrt(np.maximum(np.diagonal(block), _LEAST_VARIANCE))
-    unit = block / scale / scale[:, None]
-    if not np.all(np.abs(unit - unit.T) <= _ROUNDING):
-        raise ValueError("covariance must be symmetric")
-    try:
-        np.linalg.cholesky(unit - _LEAST_EIGENVALUE * np.eye(len(unit)))
-    except np.linalg.LinAlgError:
-        raise ValueError("covariance must be positive definite") from None
+    flaw = _flaw(np.ascontiguousarray(covariance, np.float64))
+    if flaw >= 0:
+        raise ValueError(f"covariance must be {_FLAWS[flaw]}")
+
+
+_FLAWS = ("finite where its diagonal is", "symmetric", "positive definite")
+
+
+@entry
+def _flaw(covariance: Array2) -> int:
+    """Return which of the flaws a covariance has, or -1: none."""
+    known = np.flatnonzero(~np.isinf(np.diag(covariance)))
+    block = covariance[known][:, known].copy()
+    if not np.all(np.isfinite(block)):
+        return 0
+    scale = np.sqrt(np.maximum(np.diag(block), _LEAST_VARIANCE))
+    block /= np.outer(scale, scale)
+    if not np.all(np.abs(block - block.T) <= _ROUNDING):
+        return 1
+    definite = len(known) == 0 or np.linalg.eigvalsh(block)[0] > _LEAST_EIGENVALUE
+    return -1 if definite else 2
 
 
 # Least deviation of a measurement; with it a velocity is held at its mean whatever the points say.

@@ -361,9 +361,7 @@ def truncated_cost(data: Array2, state: Array1, scale: float, bound: float) -> f
     """Sum of the truncated squared errors, px^2; stops early once it exceeds ``bound``."""
     uniform = np.empty(UNIFORM_SIZE * LANES)
     spread_state(state, scale, 0.0, uniform)
-    still = True
-    for k in range(12, STATE_SIZE):
-        still = still and state[k] == 0.0
+    still = not np.any(state[12:])
     block_costs = np.empty(LANES)
     total = 0.0
     for block in range(len(data)):

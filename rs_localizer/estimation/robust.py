@@ -312,14 +312,11 @@ def noise_deviation(squared_errors: Array1, gate: float, freedom: float) -> floa
     The errors of true inliers are Rayleigh distributed; cutting them off at the gate lowers their
     mean square by a factor that depends on the deviation itself, hence the fixed point.
     """
-    total, left = 0.0, -freedom
-    for squared in squared_errors:
-        if squared < gate * gate:
-            total += squared
-            left += 2.0
+    inside = squared_errors[squared_errors < gate * gate]
+    left = 2.0 * len(inside) - freedom
     if left <= 0.0:
         return gate / GATE
-    mean = total / left
+    mean = float(np.sum(inside)) / left
     variance = mean
     for _ in range(_NOISE_ROUNDS):
         u = gate * gate / (2.0 * max(variance, 1e-12 * gate * gate))

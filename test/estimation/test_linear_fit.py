@@ -62,7 +62,7 @@ def test_sizes_are_integrated_as_over_dense_matrices(bent):
     known = known_at(TERMS, truth)
     # One noise for all sizes: it is held, but for rounding.
     noise = Noise(NOISE, 1.0, 12.0)
-    found = fit(linear_of(lines, chosen, False, shared.rows), shared, known, noise, NO_TURN, True)
+    found = fit(linear_of(lines, chosen, False, shared), shared, known, noise, NO_TURN, True)
     dense, errors = lines.by_motion[chosen].reshape(56, 18), lines.errors[chosen].ravel()
     information, slope = known.form[:-1, :-1], known.form[:-1, -1]
     logs, steps, covariances = [], [], []
@@ -107,7 +107,7 @@ def shaking():
     """
     _, lines, truth = linearized_frame(5, 0.5, 40)
     shared = nothing_shared(40)
-    return truth, lines, shared, linear_of(lines, np.ones(40, bool), True, shared.rows)
+    return truth, lines, shared, linear_of(lines, np.ones(40, bool), True, shared)
 
 
 def whole_waves(lines):
@@ -182,14 +182,14 @@ def test_vibration_is_integrated_as_over_dense_matrices():
 def test_a_block_that_is_dropped_by_name_leaves_the_fit_without_it(name):
     truth, chosen, lines, shared, _ = everything(False)
     known, noise = known_at(TERMS, truth), Noise(NOISE, 1.0, 12.0)
-    both, nothing = linear_of(lines, chosen, True, shared.rows), nothing_shared(28)
+    both, nothing = linear_of(lines, chosen, True, shared), nothing_shared(28)
     left, turn, less = nothing, VIBRATION, both._replace(beside=np.zeros_like(both.beside[:1]))
     if name == "turn":
         kept = np.delete(np.arange(73), BLOCKS[name])
         left, turn = shared, NO_TURN
         less = Linear(both.every[kept][:, kept].copy(), both.beside[:, kept].copy())
     dropped = fit(less, left, known, noise, turn, True)
-    never = linear_of(lines, chosen, name != "turn", left.rows)
+    never = linear_of(lines, chosen, name != "turn", left)
     expected = fit(never, left, known, noise, turn, True)
     agree(dropped.step, dropped.covariance, expected.step, expected.covariance, atol=1e-12)
     assert dropped.evidence == pytest.approx(expected.evidence, abs=1e-9)
@@ -248,7 +248,7 @@ def test_no_size_of_errors_is_an_exception(noise, size):
     truth, lines, shared, _ = shaking()
     known = known_at(PRIOR, truth)
     far = lines._replace(errors=size * lines.errors)
-    linear = linear_of(far, np.ones(40, bool), True, shared.rows)
+    linear = linear_of(far, np.ones(40, bool), True, shared)
     found = fit(linear, shared, known, Noise(noise, 1.0, 18.0), VIBRATION, True)
     assert found.evidence == -np.inf or np.isfinite(found.step).all()
 
@@ -272,7 +272,7 @@ def test_noise_that_is_not_expected_speaks_for_vibration():
 
 def test_products_farther_along_the_tangent_leave_the_same_optimum():
     truth, chosen, lines, shared, _ = everything(False)
-    noise, linear = Noise(NOISE, 1.0, 12.0), linear_of(lines, chosen, False, shared.rows)
+    noise, linear = Noise(NOISE, 1.0, 12.0), linear_of(lines, chosen, False, shared)
     known = known_at(TERMS, truth)
     at_once = fit(linear, shared.at(0.2), known, noise, NO_TURN, True)
     step = 1e-3 * np.random.default_rng(0).normal(size=18)
@@ -286,11 +286,11 @@ def test_products_farther_along_the_tangent_leave_the_same_optimum():
 @pytest.mark.parametrize("bent", [False, True])
 def test_combinations_of_columns_are_orthonormal_and_say_the_same(bent):
     *_, shared, columns = everything(bent)
-    np.testing.assert_allclose(shared.rows.T @ shared.rows, np.eye(len(shared.squares)), atol=1e-9)
-    most = shared.squares.max()
-    np.testing.assert_allclose(
-        (shared.rows * shared.squares) @ shared.rows.T, columns @ columns.T, atol=1e-3 * most
-    )
+    squares, count = shared.squares, shared.rows.shape[2]
+    rows, most = np.zeros((56, len(squares))), squares.max()
+    rows[::2, :count], rows[1::2, len(squares) - count :] = shared.rows
+    np.testing.assert_allclose(rows.T @ rows, np.eye(len(squares)), atol=1e-9)
+    np.testing.assert_allclose((rows * squares) @ rows.T, columns @ columns.T, atol=1e-3 * most)
     assert np.exp(shared.odds).sum() == pytest.approx(1.0)
     # The logarithm of the size is known with a deviation of one.
     assert np.diff(shared.odds) == pytest.approx(-0.5 * np.diff(np.log(shared.sizes / 0.2) ** 2))

@@ -25,7 +25,7 @@ NUDGES = 300
 DETERMINED = {
     # Eigenvectors have either sign; what they span has none.
     "rs_localizer.estimation.linear_fit.smooth_error": lambda smooth: (
-        smooth.rows @ smooth.rows.T, *smooth[1:]
+        smooth.rows @ smooth.rows.swapaxes(1, 2), *smooth[1:]
     ),
     "rs_localizer.estimation.points.plane_of": lambda plane: (
         *plane[:2], np.outer(plane[2], plane[2])
