@@ -268,11 +268,7 @@ def colmap_parameters(camera: Camera) -> dict[str, Any]:
 
 
 # Kalibr's names of lenses, for pinholes; the others stand as camera_model.
-_KALIBR_LENSES = {
-    "radtan": DistortionModel.PLUMB_BOB,
-    "equidistant": DistortionModel.EQUIDISTANT,
-    "none": DistortionModel.PLUMB_BOB,
-}
+_KALIBR_LENSES = ("radtan", "equidistant", "none")
 _KALIBR_SPHERES = (str(DistortionModel.EUCM), str(DistortionModel.DOUBLE_SPHERE))
 
 
@@ -304,7 +300,7 @@ def kalibr_camera(tree: dict[str, Any]) -> Camera:
     # Coefficients of eucm and ds stand before the focal lengths.
     *front, fx, fy, cx, cy = map(float, tree["intrinsics"])
     D = np.array([*front, *([] if name == "none" else tree["distortion_coeffs"])], np.float64)
-    lens = _KALIBR_LENSES[name] if kind == "pinhole" else kind
+    lens = interpret_lens(name, tuple(D))[0] if kind == "pinhole" else kind
     width, height = map(int, tree["resolution"])
     return Camera(width, height, pinhole_matrix(fx, fy, cx, cy), D, lens)
 
