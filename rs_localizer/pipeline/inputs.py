@@ -50,11 +50,6 @@ class Role(Enum):
     SAMPLES = auto()  # each counts, and is used where it comes: ``use`` may run in any thread
 
 
-def _as_it_is(message: Any) -> Any:
-    """Return a message unread: most frames are read where they are localized, or never."""
-    return message
-
-
 @dataclass(frozen=True, slots=True)
 class Input:
     """One input.
@@ -70,7 +65,8 @@ class Input:
     role: Role
     use: Callable[[Any, Any], Results]
     refused: Reason
-    read: Callable[[Any], Any] = _as_it_is
+    # Most frames are read where they are localized, or never.
+    read: Callable[[Any], Any] = lambda message: message
     in_words: str = ""  # what a user is told that is missing
     necessary: bool = False  # without it no frame can be localized
     needs: str = ""  # of frames: the input that has to come first, and that only they use

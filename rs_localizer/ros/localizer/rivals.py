@@ -5,7 +5,7 @@
 import math
 import threading
 import time
-from collections import OrderedDict
+from collections import deque
 from dataclasses import replace
 from typing import Any
 
@@ -32,7 +32,7 @@ class Rivals:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._sent: OrderedDict[tuple[int, tuple[float, ...]], None] = OrderedDict()
+        self._sent: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=_REMEMBERED)
         self._first_ns: int | None = None
         self._own: set[Link] = set()
         self._parents: dict[str, tuple[str, str]] = {}  # by child: the last one, the one before
@@ -54,11 +54,9 @@ class Rivals:
         with self._lock:
             link, sent_ns = _link(message), stamp_ns(message)
             self._own.add(link)
-            self._sent[sent_ns, _numbers(message)] = None
+            self._sent.append((sent_ns, _numbers(message)))
             # Time may have gone back.
             self._first_ns = sent_ns if self._first_ns is None else min(self._first_ns, sent_ns)
-            while len(self._sent) > _REMEMBERED:
-                self._sent.popitem(last=False)
             return self._early.pop(link, None)
 
     def hear(self, message: Any, decision: Decision | None, *, static: bool) -> str:

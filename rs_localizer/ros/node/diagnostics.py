@@ -147,8 +147,7 @@ class Diagnostics:
         self._publisher = node.create_publisher(DiagnosticArray, DIAGNOSTICS, 1)
         self._timer = steady_timer(node, _PERIOD, self._tick)
 
-    def publish(self) -> Health:
-        """Publish the health now."""
+    def _tick(self) -> None:
         health, camera_frame = self._examine()
         status = DiagnosticStatus(
             level=bytes([health.level]),
@@ -160,10 +159,6 @@ class Diagnostics:
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(array)
-        return health
-
-    def _tick(self) -> None:
-        health = self.publish()
         state = health.level, health.state
         self._periods = self._periods + 1 if state == self._state else 1
         self._state = state
