@@ -4,15 +4,9 @@ import numpy as np
 import pytest
 
 from rs_localizer.core.state import step_between
+from rs_localizer.estimation import robust
 from rs_localizer.estimation.prior import motion_terms
 from rs_localizer.estimation.projection import squared_errors
-from rs_localizer.estimation.robust import (
-    apply_step,
-    inverted,
-    noise_deviation,
-    refine,
-    solve_positive,
-)
 
 from .frames import changed, differences, fitted, frame
 
@@ -23,8 +17,8 @@ def test_the_truth_is_found_from_a_global_shutter_start():
     observations, truth = frame(0, 0.2, 0.0, count=40, acceleration=0.1)
     start = truth.copy()
     start[12:] = 0.0
-    start = apply_step(start, 0.05 * np.random.default_rng(0).normal(size=18))
-    state, _, cost, converged = refine(
+    start = robust.apply_step(start, 0.05 * np.random.default_rng(0).normal(size=18))
+    state, _, cost, converged = robust.refine(
         observations.packed, start, (1e3, 0.0), NO_PRIOR, 1e-3, 2, 30, 1e-6
     )
     assert converged
@@ -38,10 +32,10 @@ def test_the_minimum_has_no_slope_of_the_posterior():
     data = changed(observations, gradient=np.zeros(2)).packed
     prior, noise = motion_terms((0.2, 0.1), (0.1, 0.05)), 0.5
     precisions = np.repeat([25.0, 100.0, 100.0, 400.0], 3)
-    state = refine(data, truth, (1e3, 0.0), prior, noise, 2, 50, 1e-6)[0]
+    state = robust.refine(data, truth, (1e3, 0.0), prior, noise, 2, 50, 1e-6)[0]
 
     def posterior(step):
-        there = apply_step(state, step)
+        there = robust.apply_step(state, step)
         errors = squared_errors(data, observations.count, there)
         return errors.sum() + noise**2 * there[12:] @ (precisions * there[12:])
 
@@ -53,8 +47,8 @@ def test_the_minimum_has_no_slope_of_the_posterior():
 
 def test_a_matrix_that_is_not_positive_is_refused():
     for matrix in (np.zeros((2, 2)), np.ones((2, 2)), -np.eye(2), np.diag([1.0, np.nan])):
-        assert not solve_positive(matrix, np.ones(2))[1]
-        assert np.isnan(inverted(matrix)).all()
+        assert not robust.solve_positive(matrix, np.ones(2))[1]
+        assert np.isnan(robust.inverted(matrix)).all()
 
 
 @pytest.mark.parametrize("size", [1, 12, 18, 54])
@@ -62,11 +56,13 @@ def test_the_inverse_is_numpy_s_also_where_parameters_are_held(size):
     rng = np.random.default_rng(size)
     factor = rng.normal(size=(size, 2 * size))
     matrix = factor @ factor.T
-    np.testing.assert_allclose(inverted(matrix), np.linalg.inv(matrix), rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(
+        robust.inverted(matrix), np.linalg.inv(matrix), rtol=1e-8, atol=1e-12
+    )
     held = np.arange(size) >= size // 2
     matrix[held, held] += 1e18
     free = np.linalg.inv(matrix[np.ix_(~held, ~held)])
-    found = inverted(matrix)
+    found = robust.inverted(matrix)
     np.testing.assert_allclose(found[np.ix_(~held, ~held)], free, rtol=1e-8, atol=1e-12)
     np.testing.assert_allclose(np.diag(found)[held], 1e-18, rtol=1e-9)
     np.testing.assert_array_equal(found, found.T)
@@ -79,17 +75,17 @@ PRIOR = motion_terms((0.18, 0.09), (0.009, 0.0036))
 @pytest.mark.parametrize("gate", [2.6, 3.5, 8.0])
 def test_noise_is_measured_whatever_the_gate_cuts_off(gate):
     errors = np.sum((1.3 * np.random.default_rng(0).normal(size=(200_000, 2))) ** 2, axis=1)
-    assert noise_deviation(errors, gate, 0.0) == pytest.approx(1.3, rel=0.03)
+    assert robust.noise_deviation(errors, gate, 0.0) == pytest.approx(1.3, rel=0.03)
 
 
 def test_noise_counts_the_degrees_of_freedom_and_never_divides_by_none():
     errors = np.full(10, 0.01)
-    assert noise_deviation(errors, 10.0, 10.0) == pytest.approx(np.sqrt(0.1 / 10), rel=1e-3)
-    assert np.isfinite(noise_deviation(errors, 10.0, 20.0))
-    assert noise_deviation(np.zeros(10), 1.0, 0.0) > 0.0
+    assert robust.noise_deviation(errors, 10.0, 10.0) == pytest.approx(np.sqrt(0.1 / 10), rel=1e-3)
+    assert np.isfinite(robust.noise_deviation(errors, 10.0, 20.0))
+    assert robust.noise_deviation(np.zeros(10), 1.0, 0.0) > 0.0
     # Points strewn evenly over the gate show no noise that fits into it.
     strewn = np.linspace(0.0, 4.0, 500)
-    assert noise_deviation(strewn, 2.0, 0.0) > 1.9
+    assert robust.noise_deviation(strewn, 2.0, 0.0) > 1.9
 
 
 def test_the_noise_of_few_points_is_not_lowered_by_what_they_fit():
