@@ -8,37 +8,25 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
+from rs_localizer.core.shutter import project_rolling
 from rs_localizer.solvers.minimal import solve_minimal
 
 from .moving import pinhole
 
-FOCAL, SIZE, THRESHOLD = 500.0, np.array([640, 480]), 2.0
-CENTRE = 0.5 * (SIZE - 1.0)
-CAMERA = pinhole(FOCAL)
+THRESHOLD, SIZE = 2.0, np.array([640, 480])
+CAMERA = pinhole()
 
 
-def row_time(pixels):
-    return (pixels[..., 1] - CENTRE[1]) / (SIZE[1] - 1)
+def shown(x, points):
+    """Pixels (n,2) of points by a motion (12,): rotation vector, C, omega, v."""
+    motion = rsl.Motion(Rotation.from_rotvec(x[:3]).as_matrix(), *x[3:].reshape(3, 3))
+    return project_rolling(CAMERA, motion.at_rows, points)[0]
 
 
-def shown(motions, points):
-    """Where (m,n,2) motions (m,12: rotation vector, C, omega, v) show points (n,3), by their rows.
-
-    NaN behind the camera, and where no row comes to see a point.
-    """
-    turns = Rotation.from_rotvec(motions[:, :3]).as_matrix()
-    middle = np.einsum("mij,nj->mni", turns, points) + motions[:, None, 3:6]
-    tau = np.zeros(middle.shape[:2])
-    for _ in range(40):
-        local = middle - tau[..., None] * motions[:, None, 9:]
-        turned = Rotation.from_rotvec((-tau[..., None] * motions[:, None, 6:9]).reshape(-1, 3))
-        local = turned.apply(local.reshape(-1, 3)).reshape(local.shape)
-        with np.errstate(all="ignore"):
-            pixels = FOCAL * local[..., :2] / local[..., 2:] + CENTRE
-        new = np.nan_to_num(np.clip(row_time(pixels), -3.0, 3.0))
-        moved, tau = np.abs(new - tau), new
-    pixels[(local[..., 2] <= 0.0) | (moved > 1e-6)] = np.nan
-    return pixels
+def cost_of(x, points, pixels):
+    """Sum of the squared errors, truncated at the threshold, and these errors (n,)."""
+    errors = np.nan_to_num(np.linalg.norm(shown(x, points) - pixels, axis=1), nan=np.inf)
+    return np.sum(np.minimum(errors, THRESHOLD) ** 2), errors
 
 
 def frame(seed, noise=0.5, wrong=0.3, count=61):
@@ -49,8 +37,8 @@ def frame(seed, noise=0.5, wrong=0.3, count=61):
         np.radians(10.0) * rng.normal(size=3) / np.sqrt(3.0), 0.05 * rng.normal(size=3),
     ])  # fmt: skip
     points = rng.uniform([-1.2, -0.9, -1.0], [1.2, 0.9, 1.0], (3 * count, 3))
-    pixels = shown(true[None], points)[0]
-    inside = np.flatnonzero(((pixels > 0.0) & (pixels < SIZE - 1)).all(axis=1))[:count]
+    pixels = shown(true, points)
+    inside = np.flatnonzero(CAMERA.inside(pixels))[:count]
     points, pixels = points[inside], pixels[inside] + noise * rng.normal(size=(count, 2))
     bad = rng.random(count) < wrong
     pixels[bad] = rng.uniform([0, 0], SIZE - 1, (bad.sum(), 2))
@@ -71,23 +59,18 @@ def test_none_is_the_best_sample_and_what_fits_it(solver, seed):
     found = rsl.Localizer(CAMERA, refinement="none", solver=solver, seed=seed).localize(
         points, pixels
     )
-    errors = np.linalg.norm(shown(motion_of(found)[None], points)[0] - pixels, axis=1)
+    least, errors = cost_of(motion_of(found), points, pixels)
     np.testing.assert_array_equal(found.inliers, errors < THRESHOLD)
     assert np.isnan(found.covariance).all()
     assert np.isnan(found.orientation_deviation)
-    rng, tau = np.random.default_rng(seed), row_time(pixels)
-    samples = np.array([rng.choice(len(points), 6, replace=False) for _ in range(100)])
-    rays, start = (pixels - CENTRE) / FOCAL, Rotation.from_rotvec(true[:3]).as_matrix()
-    rotations, c, w, t = (
-        each[:, 0] for each in solve_minimal(solver, points[samples], rays[samples], tau[samples],
-                                             start)
-    )  # fmt: skip
+    rng, start = np.random.default_rng(seed), Rotation.from_rotvec(true[:3]).as_matrix()
+    some = np.array([rng.choice(len(points), 6, replace=False) for _ in range(100)])
+    rays, tau = CAMERA.rays(pixels), CAMERA.row_time(pixels)
+    models = solve_minimal(solver, points[some], rays[some], tau[some], start)
+    rotations, c, w, t = (each[:, 0] for each in models)
     turns = Rotation.from_matrix(rotations).as_rotvec()
-    others = np.linalg.norm(
-        shown(np.hstack([turns, c, -w, np.cross(w, c) - t]), points) - pixels, axis=2
-    )
-    least = np.nansum(np.fmin(others, THRESHOLD) ** 2, axis=1).min()
-    assert np.sum(np.fmin(errors, THRESHOLD) ** 2) < 1.1 * least
+    others = np.hstack([turns, c, -w, np.cross(w, c) - t])
+    assert least < 1.1 * min(cost_of(other, points, pixels)[0] for other in others)
 
 
 def test_each_solver_is_seen_only_where_nothing_follows_it():
@@ -115,7 +98,7 @@ def test_motion_is_least_squares_of_its_inliers_without_a_prior(seed):
     same = rsl.Localizer(CAMERA, refinement="motion", velocity_prior=held).localize(points, pixels)
     np.testing.assert_array_equal(found.rotation, same.rotation)
     kept, seen = points[found.inliers], pixels[found.inliers]
-    best = least_squares(lambda x: (shown(x[None], kept)[0] - seen).ravel(), true, x_scale=0.01)
+    best = least_squares(lambda x: (shown(x, kept) - seen).ravel(), true, x_scale=0.01)
     np.testing.assert_allclose(motion_of(found)[:3], best.x[:3], atol=2e-5)
     np.testing.assert_allclose(found.linear_velocity, best.x[9:], atol=2e-4)
     np.testing.assert_allclose(found.angular_acceleration, 0.0, atol=1e-12)
