@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.data import GLOBAL_SHUTTER_TAGS
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.bags import open_bag
-from rs_localizer.io.camera_info import read_camera_info
+from rs_localizer.offline.replay import find_topics, replay
 from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.pose_at_time import twist_at
 
@@ -22,14 +22,11 @@ REGION = 12.59
 
 def replayed(count, **settings):
     """What the node would publish, a pose of each of so many frames, and what it would say."""
-    frames, notices = [], []
+    notices = list[str]()
     localizer = CameraFrames(NodeConfig(**settings), lambda _, text: notices.append(text))
     with open_bag(GLOBAL_SHUTTER_TAGS) as bag:
-        for topic, _, message in bag.messages(("/camera/camera_info", "/camera/correspondences")):
-            if topic == "/camera/camera_info":
-                localizer.calibrate(read_camera_info(message))
-            elif len(frames) < count:
-                frames.append(localizer.localize(message))
+        answers = replay(bag, find_topics(bag), localizer)
+        frames = [found for _, (*_, found) in zip(range(count), answers, strict=False)]
     assert all(frames)
     return frames, notices
 
@@ -42,9 +39,6 @@ def jitter(frames):
 
 
 def test_a_global_shutter_stays_one():
-    """Who remembers finds out that map and lens are a little off, and that the readout time is
-    wrong, after a second or two.
-    """
     frames, notices = replayed(100, readout_time=0.02)
     assert any("(a global shutter)" in text for text in notices)
     own, p3p = jitter(frames), jitter(replayed(100, solver="p3p")[0])
