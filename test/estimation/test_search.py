@@ -113,6 +113,14 @@ def test_samples_spread_over_the_rows_where_they_can(samples_of):
     assert (samples_of(np.arange(10), 5, 6, np.zeros(10)) >= 0).all()
 
 
+def test_models_become_states_by_the_motion_model(as_python):
+    model = np.random.default_rng(0).normal(size=18)
+    c, w, drift = model[9:12], model[12:15], model[15:18]
+    expected = np.concatenate([model[:12], -w, np.cross(w, c) - drift, np.zeros(6)])
+    found = as_python(search.state_of_model)(model)
+    np.testing.assert_allclose(found, expected, atol=1e-15)
+
+
 CAMERA = pinhole(1200.0, 1000, 1000, readout_time=0.0)
 TURN, WAY = np.radians(10.0), 0.1  # per readout
 
