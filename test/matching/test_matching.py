@@ -100,8 +100,8 @@ def bits(*counts: int) -> Any:
 
 def test_the_ratio_test():
     matcher = Matcher(make_map(2, descriptors=bits(0, 20)))
-    # Distances to the landmarks: 4 and 16, 9 and 11.
-    given = keypoints(2, descriptors=bits(4, 9))
+    # Distances to the landmarks: 4 and 16, 11 and 9; each landmark has a keypoint of its own.
+    given = keypoints(2, descriptors=bits(4, 11))
     assert matched(matcher, given) == {0: 0}
     found = matcher.match(given)
     assert found.scores.tolist() == [1.0 - 4 / 16]
