@@ -17,6 +17,7 @@ from typing import TypeVar
 
 from tqdm import tqdm
 
+from benchmarks import command
 from benchmarks.experiments import (
     convergence,
     from_p3p,
@@ -62,13 +63,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv = sys.argv[1:] if argv is None else argv
     if argv and argv[0] == "real":
         return real.main(argv[1:])
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks",
-        description="The experiments of the literature and ours: curves and a verdict on "
-        "every claim.",
-        epilog=_TOOLS,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    about = "The experiments of the literature and ours: curves and a verdict on every claim."
+    parser = command("", about)
+    parser.epilog = _TOOLS
     parser.add_argument(
         "names", nargs="*", metavar="NAME",
         help=f"which ones, of {', '.join(EXPERIMENTS)} (default: all)",

@@ -55,13 +55,9 @@ class Recorded:
 
 
 def record(
-    camera: Camera,
-    make_motions: MakeMotions,
-    scene: Scene,
-    size: tuple[int, int],
-    seed: int,
+    camera: Camera, make_motions: MakeMotions, scene: Scene, size: tuple[int, int], seed: int,
     imu: Imu | None = None,
-) -> Recorded:
+) -> Recorded:  # fmt: skip
     """Simulate recordings and their IMU: so many, and so many frames of each."""
     recordings, length = size
     imu = imu or Imu()

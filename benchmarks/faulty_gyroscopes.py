@@ -11,7 +11,6 @@ the frames behind the first five, beside those of the camera alone on the same f
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 from collections.abc import Sequence
@@ -19,8 +18,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks import command
 from benchmarks.aided import Recorded, believed, record
 from benchmarks.experiments.results import Table
+from benchmarks.frames.judged import REGION
 from benchmarks.independent.cameras import Camera
 from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.motions import hand
@@ -62,7 +63,6 @@ FAULTS: dict[str, Imu] = {
 }
 _NOISE = 1.0  # px
 _BEGIN = 5  # frames
-_INSIDE = 12.592  # 95 % quantile of chi-squared with six degrees of freedom
 _LENGTH = 60  # frames of a recording
 _BEFORE_NS = 600_000_000
 _LATEST_NS = 60_000_000  # stamps that are early or late by no more than this
@@ -125,7 +125,7 @@ def _errors(recorded: Recorded, frame: int, found: Estimate | None) -> tuple[flo
     squared = off @ np.linalg.solve(found.covariance[:6, :6], off)
     rate = found.angular_velocity / readout - true.angular[frame]
     degrees = np.degrees([np.linalg.norm(turn), np.linalg.norm(rate)])
-    return float(degrees[0]), float(degrees[1]), float(squared < _INSIDE)
+    return float(degrees[0]), float(degrees[1]), float(squared < REGION)
 
 
 def table(faults: Sequence[str], recordings: int, seed: int) -> Table:
@@ -152,9 +152,7 @@ def table(faults: Sequence[str], recordings: int, seed: int) -> Table:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command(".faulty_gyroscopes", __doc__)
     parser.add_argument("--recordings", type=int, default=2, help="of 60 frames; %(default)s")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("faults", nargs="*", help=", ".join(FAULTS).replace("%", "%%"))

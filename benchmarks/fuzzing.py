@@ -10,7 +10,6 @@ moment. The exit code is 1 when something fails.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import copy
 import gzip
@@ -42,6 +41,7 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_typestore
 from tqdm import tqdm
 
+from benchmarks import command
 from rs_localizer import data
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.bags import BagError, BagWriter, make_message, open_bag
@@ -594,10 +594,7 @@ def _silent_libraries() -> Iterator[TextIO]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.fuzzing", description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    parser = command(".fuzzing", __doc__)
     parser.add_argument("--executions", type=int, default=1_000_000, metavar="N")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()

@@ -125,8 +125,7 @@ class View(NamedTuple):
         inside = np.all((frame.pixels > self.low) & (frame.pixels < self.high), axis=1)
         right, share = inside & frame.inliers, self.settings.outliers
         most = round(right.sum() * share / (1.0 - share))
-        shown: BoolArray = right | (~frame.inliers & (np.cumsum(~frame.inliers) <= most))
-        return shown
+        return np.asarray(right | (~frame.inliers & (np.cumsum(~frame.inliers) <= most)))
 
 
 def view_of(
@@ -169,8 +168,7 @@ def board(motion: ConstantVelocity, rng: np.random.Generator) -> Array:
     length = rng.uniform(0.05, 0.15)
     tilted = length * flat @ so3.exp(rng.normal(0.0, 0.4, 3)).T
     tilted[:, 2] += rng.uniform(1.5, 3.0) * length * side
-    corners: Array = tilted @ state.rotations[0].T + state.positions[0]
-    return corners
+    return np.asarray(tilted @ state.rotations[0].T + state.positions[0])
 
 
 def sequence(number: int, kinds: Sequence[str] = KINDS, scene: str = "whole") -> list[Row]:
@@ -240,8 +238,7 @@ def recursive(rows: list[Row]) -> Array:
 def weights_of(wrong: Array) -> Array:
     """Of each frame, so that the share of wrong ones is that of the calibration."""
     share = wrong.mean()
-    weights: Array = np.where(wrong, BASE / share, (1.0 - BASE) / (1.0 - share))
-    return weights
+    return np.asarray(np.where(wrong, BASE / share, (1.0 - BASE) / (1.0 - share)))
 
 
 def _jumps(rows: list[Row]) -> tuple[Array, Array]:
@@ -274,17 +271,13 @@ def _regression(numbers: Array, wrong: Array, share: float, missed: float) -> Ar
         return float(np.mean(weights * -np.log(told + 1e-12))) + 1e-3 * share * float(w[1:] @ w[1:])
 
     w = minimize(loss, np.r_[math.log(share), np.zeros(numbers.shape[1])]).x
-    fitted: Array = np.r_[w[0] - np.sum(w[1:] * mean / spread), w[1:] / spread]
-    return fitted
+    return np.asarray(np.r_[w[0] - np.sum(w[1:] * mean / spread), w[1:] / spread])
 
 
 def fit(rows: list[Row]) -> None:
     """Print new constants."""
     shown = [row for row in rows if row.kind != "jumped"]  # in which frames show what is wrong
-    numbers, wrong = (
-        np.array([row.numbers for row in shown]),
-        np.array([row.wrong for row in shown]),
-    )
+    numbers, wrong = map(np.array, zip(*((row.numbers, row.wrong) for row in shown), strict=True))
     own = [k for k in range(numbers.shape[1]) if k != INNOVATION]
     found = _regression(numbers[:, own], wrong, 0.5, 0.05)
     innovations, jumped = _jumps(rows)

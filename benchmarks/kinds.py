@@ -125,15 +125,13 @@ def _facing(rng: np.random.Generator) -> Array:
 
 def _hall(rng: np.random.Generator) -> Array:
     """Points around a way of ten metres."""
-    points: Array = rng.uniform(-9.0, 9.0, (200, 3)) * [1.0, 0.3, 1.0]
-    return points
+    return np.asarray(rng.uniform(-9.0, 9.0, (200, 3)) * [1.0, 0.3, 1.0])
 
 
 def _room(rng: np.random.Generator) -> Array:
     """Points at all depths."""
     low, high = (-1.8, -1.2, 1.5), (1.8, 1.2, 4.0)
-    points: Array = rng.uniform(low, high, (150, 3))
-    return points
+    return np.asarray(rng.uniform(low, high, (150, 3)))
 
 
 def _tilted(
@@ -381,8 +379,7 @@ def _frames(
         now = (times[:, None] + delay).ravel()
         rotation, position = motions.poses(np.full(len(now), k), now)
         local = np.einsum("nji,nj->ni", rotation, every.reshape(-1, 3) - position)
-        placed: Array = local.reshape(every.shape)
-        return placed
+        return np.asarray(local.reshape(every.shape))
 
     exact = camera.project_rolling(local_at, every.shape[:2])
     return exact, camera.bearings(exact), points

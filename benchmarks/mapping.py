@@ -7,7 +7,6 @@ python -m benchmarks.mapping bend surveys walks
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
@@ -16,9 +15,10 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2, norm
 
+from benchmarks import command
 from benchmarks.aided import believed
+from benchmarks.frames.judged import FIVE_SIGMA, REGION
 from benchmarks.independent import cameras
 from benchmarks.independent.rotations import Array, exponential, logarithm
 from rs_localizer.cli.options import integer
@@ -34,8 +34,7 @@ from rs_localizer.tools.mapping.build import Built, Given, built_from
 from rs_localizer.tools.mapping.gauge import scaled, through
 from rs_localizer.tools.mapping.map_keypoints import MapFreedom, MapObservations, Start
 from rs_localizer.tools.mapping.refinement import refine
-from rs_localizer.tools.mapping.seen_images import SeenImage
-from rs_localizer.tools.mapping.structure import Structure
+from rs_localizer.tools.mapping.structure import SeenImage, Structure
 from rs_localizer.tools.mapping.survey import Survey, survey
 from rs_localizer.tools.mapping.unknown_markers import Filmed, Spotted, every_marker
 from rs_localizer.tracking import FrameContext, Tracker
@@ -48,7 +47,6 @@ _NOISE, _MARKER_NOISE, _OFF = 0.3, 0.1, 0.02  # px, px, m
 _CAMERA = cameras.Camera()
 _READOUT = _CAMERA.readout_time  # s
 _FAMILY = "4x4_50"
-_FIVE = float(chi2.isf(2.0 * norm.sf(5.0), 6))
 _START_NS = 10**12
 
 Pose = tuple[Array, Array]
@@ -111,9 +109,7 @@ class Film:
             pixels.append(shown[found] + rng.normal(0.0, _NOISE, (len(found), 2)))
         return MapObservations(
             _START_NS + np.round(1e9 * self.stamps).astype(np.int64),
-            np.concatenate(images),
-            np.concatenate(landmarks),
-            np.concatenate(pixels),
+            *map(np.concatenate, (images, landmarks, pixels)),
         )
 
     def near(self, points: Array, rng: np.random.Generator) -> Start:
@@ -173,9 +169,8 @@ def bend(seed: int) -> Iterator[str]:
     def errors(own: Array) -> str:
         """Of landmarks, but for the whole's place and size."""
         off = through(own[of], points[of])(own[of]) - points[of]
-        return "{:8.2f} {:8.2f}".format(
-            *1e3 * np.percentile(np.linalg.norm(off, axis=1), [50.0, 95.0])
-        )
+        median, most = 1e3 * np.percentile(np.linalg.norm(off, axis=1), [50.0, 95.0])
+        return f"{median:8.2f} {most:8.2f}"
 
     yield "map refine                   landmarks  median    95 % (mm)  noise (px)  readout (ms)"
     for name, readout, free, offset in (
@@ -269,11 +264,8 @@ def _survey(wall: bool, seeds: list[int]) -> _Errors:
     shape = _off(found, true, over, squares.mean(axis=0) - over @ ours.mean(axis=0))
     own = off[1:].ravel()
     squared = float(own @ np.linalg.solve(found.covariance[6:, 6:], own)) / len(own)
-    return _Errors(
-        (off[1:], shape),
-        (off[1:] / found.deviations[1:], shape / found.deviations_of_shape),
-        squared,
-    )
+    normalized = off[1:] / found.deviations[1:], shape / found.deviations_of_shape
+    return _Errors((off[1:], shape), normalized, squared)
 
 
 def _off(found: Survey, true: list[Pose], turn: Array, shift: Array) -> Array:
@@ -328,8 +320,8 @@ def walks(seed: int) -> Iterator[str]:
         yield (
             f"{name:22} {len(true):9} {1e3 * np.median(off):9.1f} {1e3 * np.median(shared):11.1f} "
             f"{len(found):6} {1e3 * np.median(error):6.1f} {1e3 * np.median(claimed):13.1f} "
-            f"{100.0 * np.mean(squared < chi2.ppf(0.95, 6)):9.0f} "
-            f"{np.count_nonzero(squared > _FIVE):3}"
+            f"{100.0 * np.mean(squared < REGION):9.0f} "
+            f"{np.count_nonzero(squared > FIVE_SIGMA):3}"
         )
 
 
@@ -392,11 +384,7 @@ _PARTS: dict[str, Callable[[int], Iterator[str]]] = {
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.mapping",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command(".mapping", __doc__)
     parser.add_argument("names", nargs="+", metavar="PART", choices=_PARTS, help=", ".join(_PARTS))
     parser.add_argument("--seed", type=integer(0), default=0, metavar="N")
     options = parser.parse_args()

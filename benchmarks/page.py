@@ -9,12 +9,13 @@ a name all blocks are filled anew.
 
 from __future__ import annotations
 
-import argparse
 import re
 import subprocess
 import sys
 from datetime import date
 from pathlib import Path
+
+from benchmarks import command
 
 ROOT = Path(__file__).parents[1]
 PAGE, RESULTS = ROOT / "docs" / "benchmarks.md", ROOT / "benchmarks" / "results"
@@ -54,10 +55,7 @@ def record(name: str, printed: str) -> None:
 
 def main() -> int:
     """Record one block, or fill all of them; the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.page", description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    parser = command(".page", __doc__)
     page = PAGE.read_text(encoding="utf-8")
     known = sorted({*blocks(page), *(file.stem for file in RESULTS.glob("*.txt"))})
     parser.add_argument("name", nargs="?", choices=known, help="of the file")

@@ -11,16 +11,16 @@ from __future__ import annotations
 import argparse
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import product
 
 import numpy as np
-from scipy.stats import chi2, norm
 
 import rs_localizer as rsl
 from benchmarks.aided import believed
+from benchmarks.frames.judged import FIVE_SIGMA, REGION
 from benchmarks.independent.cameras import Camera
 from benchmarks.independent.frames import PERIOD_NS
 from benchmarks.independent.motions import hand
@@ -31,7 +31,6 @@ from benchmarks.independent.scenes import visible
 _CAMERA = Camera(focal=450.0)
 _POINTS = 152  # of all cameras
 _UPRIGHT, _TURNED = np.eye(3), np.diag([-1.0, -1.0, 1.0])
-_REGION = float(chi2.ppf(0.95, 6))
 _UNITS = np.array([math.degrees(1.0), 1e3])
 
 
@@ -50,11 +49,6 @@ RIGS: dict[str, dict[str, Mounted]] = {
     "two opposed": {"a": _at(_UPRIGHT, (-0.05, 0.0, 0.0)), "b": _at(_TURNED, (0.05, 0.0, 0.0))},
     "back to back": {"a": _around(0.0), "b": _around(180.0)},
 }
-
-
-def _rig(mounted: Mapping[str, Mounted]) -> rsl.Rig:
-    places = {name: (each.rotation, each.translation) for name, each in mounted.items()}
-    return rsl.Rig(dict.fromkeys(mounted, believed(_CAMERA)), places)
 
 
 def _moved(metres: float, degrees: float, mounted: Mounted, rng: np.random.Generator) -> Mounted:
@@ -85,16 +79,17 @@ WRONG: dict[str, Callable[[Mounted, np.random.Generator], Mounted]] = {
 }
 """What the last camera of a rig has wrong; the others are as they are said to be."""
 _FRAMES, _NOISE, _WIDER = 30, 0.3, 0.2  # of a recording; px; of the image, where landmarks are
-_FIVE = float(chi2.isf(2.0 * norm.sf(5.0), 6))
 
 
 def wrong(name: str, scene: Scene, fault: str, seed: int) -> str:
     """A line of two recordings of a hand-held rig, tracked with the settings of a user."""
     rng, told, far, said = np.random.default_rng(seed), RIGS[name], [], Counter[str]()
     middle, errors = middle_of(told), []
+    places = {each: (mounted.rotation, mounted.translation) for each, mounted in told.items()}
+    localizer = rsl.Localizer(rsl.Rig(dict.fromkeys(told, believed(_CAMERA)), places))
     for _ in range(2):
         true = {**told, list(told)[-1]: WRONG[fault](told[list(told)[-1]], rng)}
-        motions, tracker = hand(1, rng), rsl.Tracker(rsl.Localizer(_rig(told)))
+        motions, tracker = hand(1, rng), rsl.Tracker(localizer)
         seen = views(told, motions, np.zeros(1), 2 * _POINTS // len(told), scene, rng, _WIDER)
         for frame in range(_FRAMES):
             begin = 1e-9 * PERIOD_NS * (frame - _FRAMES // 2)
@@ -123,11 +118,11 @@ def wrong(name: str, scene: Scene, fault: str, seed: int) -> str:
             ])  # fmt: skip
     off, squared = np.reshape(errors, (-1, 4, 3)), np.reshape(far, (-1, 2))
     middles = np.median(np.linalg.norm(off[:, :2], axis=2), axis=0) * _UNITS if far else [0, 0]
-    inside = " ".join(f"{100 * np.mean(each < _REGION):.0f}" for each in squared.T if far)
+    inside = " ".join(f"{100 * np.mean(each < REGION):.0f}" for each in squared.T if far)
     words = ", ".join(f"{count} {word}" for word, count in said.items() if count) or "nothing"
     return (
         f"| {name} | {scene} | {fault} | {len(far)} | {middles[0]:.2g}, {middles[1]:.2g} | "
-        f"{inside} | {np.sum(squared.max(axis=1, initial=0.0) > _FIVE)} | {words} |"
+        f"{inside} | {np.sum(squared.max(axis=1, initial=0.0) > FIVE_SIGMA)} | {words} |"
     )
 
 

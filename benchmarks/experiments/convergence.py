@@ -47,6 +47,11 @@ def run(context: Context) -> Result:
     trials = draw_trials(context.trials, context.seed, _MOVING)
     algebraic = {method.name: _algebraic(method, trials) for method in _LINEAR}
     once, fifty = by_count[1], by_count[50]
+    chosen = [_STEPS.index(count) for count in (1, 2, 5, 8, 20, 50)]
+    heading = ("algebraic error, iterations:", *(str(_STEPS[k]) for k in chosen))
+    shown = Table(
+        heading, [(name, *(f"{of[k]:.0e}" for k in chosen)) for name, of in algebraic.items()]
+    )
     falls = np.array([np.diff(algebraic[method.name]) for method in m.TWO_STEP])
     slow = [_over(fifty, once, method, m.VCWT)[2:] for method in m.TWO_STEP]
     return Result(
@@ -77,7 +82,7 @@ def run(context: Context) -> Result:
                 [algebraic[x.name][-1] / algebraic[x.name][0] for x in m.TWO_STEP], most=0.2,
             ),
         ],
-        [_shown(by_count), _shown_algebraic(algebraic)],
+        [_shown(by_count), shown.text()],
     )  # fmt: skip
 
 
@@ -143,8 +148,7 @@ def _steepness(method: Method, trials: Trials) -> float:
 
 def algebraic_errors(found: Motions, trials: Trials) -> Array:
     """How far (h,) motions are from solving the equations of their six points."""
-    errors: Array = np.linalg.norm(_missed(found, trials), axis=1)
-    return errors
+    return np.asarray(np.linalg.norm(_missed(found, trials), axis=1))
 
 
 def _missed(found: Motions, trials: Trials) -> Array:
@@ -163,8 +167,7 @@ def _missed(found: Motions, trials: Trials) -> Array:
     local = turned + tau * np.cross(found.w[:, None], turned)
     local += found.translation[:, None] + tau * found.t[:, None]
     missed = trials.rays[:, :_SIX] * local[..., 2:] - local[..., :2]
-    errors: Array = missed.reshape(len(trials), -1)
-    return errors
+    return np.asarray(missed.reshape(len(trials), -1))
 
 
 def _over(
@@ -183,17 +186,7 @@ def _shown(by_count: dict[int, Curves]) -> str:
             if method is m.R6P and count > 1:
                 continue
             errors = curves.medians(method)[places, ORIENTATION]
-            rows.append((method.name, "" if method is m.R6P else count, *map(_short, errors)))
+            shown = (f"{error:.2g}" for error in errors)
+            rows.append((method.name, "" if method is m.R6P else count, *shown))
     return Table(("Fig. 3: orientation (deg), motion:", "iterations", "6 deg", "15 deg", "30 deg"),
                  rows).text()  # fmt: skip
-
-
-def _shown_algebraic(algebraic: dict[str, Array]) -> str:
-    chosen = [_STEPS.index(count) for count in (1, 2, 5, 8, 20, 50)]
-    rows = [(name, *(f"{errors[k]:.0e}" for k in chosen)) for name, errors in algebraic.items()]
-    heading = ("algebraic error, iterations:", *(str(_STEPS[k]) for k in chosen))
-    return Table(heading, rows).text()
-
-
-def _short(value: float) -> str:
-    return f"{value:.2g}"

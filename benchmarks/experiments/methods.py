@@ -104,14 +104,10 @@ def _models(method: Method, trials: Trials, initial: Array) -> Array:
 
 
 def _triplet_models(trials: Trials) -> Array:
-    models = _stacked(
-        solve_minimal(
-            "p3p",
-            trials.points[:, _TRIPLETS].reshape(-1, 3, 3),
-            trials.rays[:, _TRIPLETS].reshape(-1, 3, 2),
-            trials.tau[:, _TRIPLETS].reshape(-1, 3),
-        )
-    )
+    points, rays, tau = (of[:, _TRIPLETS] for of in (trials.points, trials.rays, trials.tau))
+    models = _stacked(solve_minimal(
+        "p3p", points.reshape(-1, 3, 3), rays.reshape(-1, 3, 2), tau.reshape(-1, 3)
+    ))  # fmt: skip
     return models.reshape(len(trials), -1, models.shape[-1])
 
 

@@ -98,12 +98,8 @@ def _median_bound(trials: Trials, points: int, seed: int) -> Array:
     draws = np.random.default_rng([seed, 2]).normal(size=(len(trials), half.shape[2]))
     errors = np.einsum("hij,hj->hi", half, draws)
     distance = np.linalg.norm(trials.truth.position, axis=1)
-    return np.array(
-        [
-            np.median(np.degrees(np.linalg.norm(errors[:, 0:3], axis=1))),
-            np.median(np.linalg.norm(errors[:, 3:6], axis=1) / distance),
-        ]
-    )
+    turns, moves = (np.linalg.norm(errors[:, k : k + 3], axis=1) for k in (0, 3))
+    return np.array([np.median(np.degrees(turns)), np.median(moves / distance)])
 
 
 def _alike(name: str, who: str, methods: Sequence[Method], curves: Curves) -> Claim:

@@ -27,15 +27,12 @@ def motion_errors(found: Motions, truth: Motions) -> Array:
     The position's is relative to the camera's distance from the centre of the points.
     """
     distance = np.linalg.norm(truth.position, axis=1)
-    errors = np.stack(
-        [
-            angles(found.rotation, truth.rotation),
-            np.linalg.norm(found.position - truth.position, axis=1) / distance,
-            np.degrees(np.linalg.norm(found.w - truth.w, axis=1)),
-            np.linalg.norm(found.t - truth.t, axis=1),
-        ],
-        axis=1,
-    )
+    errors = np.column_stack([
+        angles(found.rotation, truth.rotation),
+        np.linalg.norm(found.position - truth.position, axis=1) / distance,
+        np.degrees(np.linalg.norm(found.w - truth.w, axis=1)),
+        np.linalg.norm(found.t - truth.t, axis=1),
+    ])  # fmt: skip
     return np.where(np.isnan(errors), np.inf, errors)
 
 
@@ -70,12 +67,9 @@ class Curves:
 
 
 def sweep(
-    context: Context,
-    x: Sequence[float],
-    setting: Callable[[float], Setting],
-    methods: Sequence[Method],
-    initial: Initial | None = None,
-) -> Curves:
+    context: Context, x: Sequence[float], setting: Callable[[float], Setting],
+    methods: Sequence[Method], initial: Initial | None = None,
+) -> Curves:  # fmt: skip
     """Run the methods on ``context.trials`` frames at each place.
 
     Args:

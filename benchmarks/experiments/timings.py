@@ -39,15 +39,11 @@ class Budget(NamedTuple):
 
 
 _BUDGETS = (
-    Budget("p3p", 1, 0.30, 3.0),
-    Budget("r6p_vcwt", 1, 0.20, 10.0),
-    Budget("r6p_vcwt", 5, 0.60, 10.0),
-    Budget("r6p_vct_w", 1, 0.45, 24.0),
-    Budget("r6p_vct_wt", 1, 0.45, 30.0),
-    Budget("r6p_vc_wt", 1, 0.45, 27.0),
-    Budget("r9p", 1, 0.60, 20.0),
-    Budget("r6p", 1, 140.0, 1700.0),
-)
+    Budget("p3p", 1, 0.30, 3.0), Budget("r6p_vcwt", 1, 0.20, 10.0),
+    Budget("r6p_vcwt", 5, 0.60, 10.0), Budget("r6p_vct_w", 1, 0.45, 24.0),
+    Budget("r6p_vct_wt", 1, 0.45, 30.0), Budget("r6p_vc_wt", 1, 0.45, 27.0),
+    Budget("r9p", 1, 0.60, 20.0), Budget("r6p", 1, 140.0, 1700.0),
+)  # fmt: skip
 
 
 def run(context: Context) -> Result:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from operator import attrgetter
 
 import numpy as np
 
@@ -55,8 +56,7 @@ class Motions:
     @property
     def position(self) -> Array:
         """Camera centres (h,3) in the world."""
-        centre: Array = -np.einsum("hji,hj->hi", self.rotation, self.translation)
-        return centre
+        return np.asarray(-np.einsum("hji,hj->hi", self.rotation, self.translation))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,8 +106,7 @@ def random_rotations(count: int, seed: int, degrees: float) -> Array:
 def angles(rotations: Array, others: Array) -> Array:
     """Angles in degrees between rotations (...,3,3); accurate near zero, NaN for NaN."""
     apart = np.linalg.norm(rotations - others, axis=(-2, -1))
-    between: Array = np.degrees(2.0 * np.arcsin(np.minimum(apart / np.sqrt(8.0), 1.0)))
-    return between
+    return np.asarray(np.degrees(2.0 * np.arcsin(np.minimum(apart / np.sqrt(8.0), 1.0))))
 
 
 def _draw(count: int, rng: np.random.Generator, setting: Setting) -> Trials:
@@ -153,16 +152,13 @@ def _looking_at_the_centre(count: int, rng: np.random.Generator) -> tuple[Array,
 
 def _directions(count: int, rng: np.random.Generator) -> Array:
     vectors = rng.normal(size=(count, 3))
-    unit: Array = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    return unit
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
 def _join(parts: list[Trials]) -> Trials:
-    def joined(name: str) -> Array:
-        return np.concatenate([getattr(part, name) for part in parts])
+    def joined(*names: str) -> list[Array]:
+        return [np.concatenate([attrgetter(name)(part) for part in parts]) for name in names]
 
-    def true(name: str) -> Array:
-        return np.concatenate([getattr(part.truth, name) for part in parts])
-
-    truth = Motions(true("rotation"), true("translation"), true("w"), true("t"))
-    return Trials(joined("points"), joined("rays"), joined("tau"), truth)
+    points, rays, tau = joined("points", "rays", "tau")
+    truth = joined("truth.rotation", "truth.translation", "truth.w", "truth.t")
+    return Trials(points, rays, tau, Motions(*truth))

@@ -35,8 +35,7 @@ _TOGETHER = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
-    result: int = options.command(options)
-    return result
+    return int(options.command(options))
 
 
 def _parser() -> argparse.ArgumentParser:

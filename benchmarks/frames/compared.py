@@ -90,12 +90,7 @@ def read(table: Path) -> dict[str, Judged]:
 
 def changes_of(before: Judged, after: Judged) -> dict[str, Change]:
     """Every figure that is compared, by its name."""
-    found = {}
-    hits = [_hits(one) for one in (before, after)]
-    for name in _SHARES:
-        change = _share(hits[0][name], hits[1][name], before.of("recording"))
-        if change is not None:
-            found[name] = change
+    found = _shares(before, after)
     both = before.localized & after.localized
     for name, figure in _ERRORS.items():
         errors = [one.of(figure)[both] for one in (before, after)]
@@ -119,6 +114,13 @@ def _hits(judged: Judged) -> dict[str, tuple[BoolArray, BoolArray]]:
         "in/ref": (inside["pose"] | ~some, every),
         "not>5s": (~far_off(judged), every),
     }
+
+
+def _shares(before: Judged, after: Judged) -> dict[str, Change]:
+    """The shares that both have, by their names."""
+    hits, recording = [_hits(one) for one in (before, after)], before.of("recording")
+    every = {name: _share(hits[0][name], hits[1][name], recording) for name in _SHARES}
+    return {name: change for name, change in every.items() if change is not None}
 
 
 def _share(
@@ -163,10 +165,8 @@ def _line(figures: Mapping[str, Change], every: bool) -> str:
         elif name == "ms":
             text = f"{change.before:.2f} -> {change.after:.2f}"
         else:
-            text = (
-                f"{change.before:.3g} -> {change.after:.3g} "
-                f"(x {change.low:.2f} to {change.high:.2f})"
-            )
+            text = f"{change.before:.3g} -> {change.after:.3g} "
+            text += f"(x {change.low:.2f} to {change.high:.2f})"
         parts.append(f"{name} {text}{marks[change.sign]}")
     return "; ".join(parts)
 
@@ -201,18 +201,11 @@ def totals_line(label: str, row: Mapping[str, float] | None, width: int = 12) ->
 
 
 def changes_together(
-    before: Mapping[str, Judged],
-    after: Mapping[str, Judged],
+    before: Mapping[str, Judged], after: Mapping[str, Judged],
     changes: Mapping[str, Mapping[str, Change]],
-) -> dict[str, Change]:
+) -> dict[str, Change]:  # fmt: skip
     """Of conditions together: shares of all frames, and the mean ratio of the errors."""
-    joined = [_joined([table[name] for name in changes]) for table in (before, after)]
-    hits = [_hits(one) for one in joined]
-    found = {}
-    for name in _SHARES:
-        change = _share(hits[0][name], hits[1][name], joined[0].of("recording"))
-        if change is not None:
-            found[name] = change
+    found = _shares(*(_joined([table[name] for name in changes]) for table in (before, after)))
     for name in _ERRORS:
         those = [each[name] for each in changes.values() if name in each]
         pairs = [(one.before, one.after) for one in those if one.before > 0.0 and one.after > 0.0]
@@ -245,10 +238,9 @@ def _joined(those: Sequence[Judged]) -> Judged:
 
 
 def _write_totals(
-    before: Mapping[str, Judged],
-    after: Mapping[str, Judged],
+    before: Mapping[str, Judged], after: Mapping[str, Judged],
     changes: Mapping[str, Mapping[str, Change]],
-) -> None:
+) -> None:  # fmt: skip
     """Two rows for each bench, and what is certain of all its conditions together."""
     both = [totals({name: table[name] for name in changes}) for table in (before, after)]
     sys.stdout.write(f"\n{totals_line('', None)}\n")

@@ -53,6 +53,7 @@ class Sequence:
 SINGLE = Sequence()
 # As long as a tracker needs to settle, and the five after that.
 TRACKED = Sequence(8, (3, 8))
+_BOTH = ("", SINGLE), ("/tracked", TRACKED)  # what names end in
 
 
 @dataclass(frozen=True)
@@ -167,11 +168,10 @@ def _grid() -> Iterator[tuple[Any, ...]]:
     scenes: dict[str, Scene] = {
         "rich": Rich(), "wall": Wall(), "plane": SmallPlane(), "board": Board()
     }  # fmt: skip
-    for (name, motion), (where, scene), noise, tracked in product(
-        moves.items(), scenes.items(), (0.05, 0.3, 1.0, 3.0), (False, True)
+    for (name, motion), (where, scene), noise, (end, sequence) in product(
+        moves.items(), scenes.items(), (0.05, 0.3, 1.0, 3.0), _BOTH
     ):
-        label = f"{name}/{where}/{noise:g}px{'/tracked' * tracked}"
-        yield label, motion, scene, noise, {"sequence": (SINGLE, TRACKED)[tracked]}
+        yield f"{name}/{where}/{noise:g}px{end}", motion, scene, noise, {"sequence": sequence}
 
 
 def _few() -> Iterator[tuple[Any, ...]]:
@@ -274,18 +274,17 @@ def _student() -> Iterator[tuple[Any, ...]]:
 
 
 def _shared() -> Iterator[tuple[Any, ...]]:
-    for scene, noise, tracked in product(("rich", "wall"), (0.3, 1.0), (False, True)):
-        others = {"points": Points(shift=0.3), "sequence": (SINGLE, TRACKED)[tracked]}
-        label = f"{scene}/{noise:g}px{'/tracked' * tracked}"
-        yield label, HAND, SEEN[scene], noise, others
+    for scene, noise, (end, sequence) in product(("rich", "wall"), (0.3, 1.0), _BOTH):
+        others = {"points": Points(shift=0.3), "sequence": sequence}
+        yield f"{scene}/{noise:g}px{end}", HAND, SEEN[scene], noise, others
 
 
 def _body() -> Iterator[tuple[Any, ...]]:
-    for (name, motion), noise, tracked in product(
-        (("hand", HAND), ("rest", REST)), (0.3, 1.0), (False, True)
+    for (name, motion), noise, (end, sequence) in product(
+        (("hand", HAND), ("rest", REST)), (0.3, 1.0), _BOTH
     ):
-        others = {"points": Points(body=1.0 / 3.0), "sequence": (SINGLE, TRACKED)[tracked]}
-        yield f"{name}/{noise:g}px{'/tracked' * tracked}", motion, Rich(), noise, others
+        others = {"points": Points(body=1.0 / 3.0), "sequence": sequence}
+        yield f"{name}/{noise:g}px{end}", motion, Rich(), noise, others
 
 
 def _camera() -> Iterator[tuple[Any, ...]]:
@@ -297,30 +296,24 @@ def _camera() -> Iterator[tuple[Any, ...]]:
         "lens 30%": Calibration(distortion=0.3),
         "ten boards": Calibration(boards=10),
     }
-    for (error, calibration), scene, noise, tracked in product(
-        errors.items(), ("rich", "wall"), (0.3, 1.0), (False, True)
+    for (error, calibration), scene, noise, (end, sequence) in product(
+        errors.items(), ("rich", "wall"), (0.3, 1.0), _BOTH
     ):
-        others = {"calibration": calibration, "sequence": (SINGLE, TRACKED)[tracked]}
-        label = f"{error}/{scene}/{noise:g}px{'/tracked' * tracked}"
-        yield label, HAND, SEEN[scene], noise, others
+        others = {"calibration": calibration, "sequence": sequence}
+        yield f"{error}/{scene}/{noise:g}px{end}", HAND, SEEN[scene], noise, others
 
 
 def _map() -> Iterator[tuple[Any, ...]]:
-    maps = {
-        "perfect": CLEAN,
-        "bent 1cm": Points(bent_map=0.01),
-        "rough 1cm": Points(rough_map=0.01),
-    }
-    for (name, points), scene, noise, tracked in product(
-        maps.items(), ("rich", "wall"), (0.3, 1.0), (False, True)
+    maps = (
+        ("perfect", CLEAN), ("bent 1cm", Points(bent_map=0.01)),
+        ("rough 1cm", Points(rough_map=0.01)),
+    )  # fmt: skip
+    for (name, points), scene, noise, (end, sequence) in product(
+        maps, ("rich", "wall"), (0.3, 1.0), _BOTH
     ):
-        others = {
-            "points": points,
-            "settings": (("map_deviation", 0.01),),
-            "sequence": (SINGLE, TRACKED)[tracked],
-        }
-        label = f"{name}/{scene}/{noise:g}px{'/tracked' * tracked}"
-        yield label, HAND, SEEN[scene], noise, others
+        settings = (("map_deviation", 0.01),)
+        others = {"points": points, "settings": settings, "sequence": sequence}
+        yield f"{name}/{scene}/{noise:g}px{end}", HAND, SEEN[scene], noise, others
 
 
 def _locks() -> Iterator[tuple[Any, ...]]:
@@ -358,15 +351,12 @@ def _axis() -> Iterator[tuple[Any, ...]]:
 
 
 def _global() -> Iterator[tuple[Any, ...]]:
-    for (name, scene), noise, tracked in product(
-        (("rich", Rich()), ("board", Board())), (0.1, 0.5), (False, True)
+    calibration = Calibration(readout_time=_WRONG_READOUT)
+    for (name, scene), noise, (end, sequence) in product(
+        (("rich", Rich()), ("board", Board())), (0.1, 0.5), _BOTH
     ):
-        others = {
-            "camera": GLOBAL,
-            "calibration": Calibration(readout_time=_WRONG_READOUT),
-            "sequence": (SINGLE, TRACKED)[tracked],
-        }
-        yield f"{name}/{noise:g}px{'/tracked' * tracked}", SLOW_HAND, scene, noise, others
+        others = {"camera": GLOBAL, "calibration": calibration, "sequence": sequence}
+        yield f"{name}/{noise:g}px{end}", SLOW_HAND, scene, noise, others
 
 
 def _boards() -> Iterator[tuple[Any, ...]]:

@@ -13,7 +13,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from benchmarks.frames.conditions import Condition, Motion, Points
+from benchmarks.frames.conditions import Condition, Motion
 from benchmarks.independent.cameras import Camera
 from benchmarks.independent.frames import Displaced, Frames, first_row_times, simulate
 from benchmarks.independent.motions import IntArray, Moving, States, directions
@@ -66,28 +66,18 @@ def generate(condition: Condition, frames: int, seed: int) -> Iterator[Frame]:
     else:
         recordings = max(min(_FEWEST, frames), -(-frames // (last - first)))
     made = _simulated(
-        condition.camera,
-        condition.motion,
-        condition.scene,
-        recordings,
-        condition.sequence.length,
-        seed,
-        condition.points.body,
-    )
+        condition.camera, condition.motion, condition.scene, recordings, condition.sequence.length,
+        seed, condition.points.body,
+    )  # fmt: skip
     key = zlib.crc32(f"{condition.bench}/{condition.name}".encode())
     spoil = _Spoiler(condition, recordings, np.random.default_rng([seed, key]))
     for frame in range(len(made.frames)):
         place = int(made.frames.place[frame])
-        yield Frame(
-            int(made.frames.recording[frame]),
-            place,
-            made.frames.middle_ns(frame),
-            *spoil(made.frames, frame),
-            first <= place < last,
-            _state(made.frames.first, frame),
-            _state(made.frames.middle, frame),
-            _gyroscope(made, frame, spoil.rng) if condition.points.gyroscope else None,
-        )
+        recording, measured = int(made.frames.recording[frame]), spoil(made.frames, frame)
+        states = _state(made.frames.first, frame), _state(made.frames.middle, frame)
+        gyroscope = _gyroscope(made, frame, spoil.rng) if condition.points.gyroscope else None
+        middle_ns, counts = made.frames.middle_ns(frame), first <= place < last
+        yield Frame(recording, place, middle_ns, *measured, counts, *states, gyroscope)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,14 +89,9 @@ class _Made:
 
 @lru_cache(maxsize=4)
 def _simulated(
-    camera: Camera,
-    motion: Motion,
-    scene: Scene,
-    recordings: int,
-    length: int,
-    seed: int,
+    camera: Camera, motion: Motion, scene: Scene, recordings: int, length: int, seed: int,
     body: float,
-) -> _Made:
+) -> _Made:  # fmt: skip
     made: list[Moving] = []
 
     def remembered(count: int, rng: np.random.Generator) -> Moving:
@@ -159,7 +144,8 @@ class _Spoiler:
             noise = noise / np.sqrt(spread)
         pixels = frames.exact[frame, shown] + noise + points.shift * self._direction[recording]
         mapped = frames.points[frame, shown]
-        mapped = mapped + self._map_error(mapped, recording, points)
+        rough = points.rough_map * rng.normal(size=mapped.shape)
+        mapped = mapped + (rough + points.bent_map * self._map(mapped, recording))
         begin, end, shift = condition.sequence.bad
         if begin <= place < end:
             some = rng.permutation(len(pixels))[: round(_SHIFTED * len(pixels))]
@@ -184,11 +170,6 @@ class _Spoiler:
             pixels[some] = rng.uniform(_MARGIN, far, (count, 2))
         return mapped, pixels
 
-    def _map_error(self, places: Array, recording: int, points: Points) -> Array:
-        rough = points.rough_map * self.rng.normal(size=places.shape)
-        error: Array = rough + points.bent_map * self._map(places, recording)
-        return error
-
 
 def _slipped(mapped: Array, pixels: Array, direction: Array, share: float, cell: float) -> Array:
     """Points (n,3) with those farthest to one side of the image moved by a cell (m) along it."""
@@ -211,8 +192,7 @@ class _BentMap:
 
     def __call__(self, places: Array, recording: int) -> Array:
         waves = np.sin(places @ self._waves[recording].T + self._phase[recording])
-        error: Array = waves @ self._way[recording]
-        return error
+        return np.asarray(waves @ self._way[recording])
 
 
 def calibrated(camera: Camera, boards: int, seed: int) -> tuple[Array, Array]:
@@ -228,23 +208,16 @@ def calibrated(camera: Camera, boards: int, seed: int) -> tuple[Array, Array]:
         if visible(camera, pixels).all():
             views.append(pixels + _CORNER_NOISE * rng.normal(size=pixels.shape))
     _, matrix, distortion, _, _ = cv2.calibrateCamera(
-        [flat.astype(np.float32)] * boards,
-        [one.astype(np.float32) for one in views],
-        (camera.width, camera.height),
-        camera.matrix,
-        np.zeros(5),
+        [flat.astype(np.float32)] * boards, [one.astype(np.float32) for one in views],
+        (camera.width, camera.height), camera.matrix, np.zeros(5),
         flags=cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3,
-    )
+    )  # fmt: skip
     return np.array(matrix, np.float64), np.array(distortion, np.float64).ravel()
 
 
 def _state(states: States, frame: int) -> tuple[Array, ...]:
-    return (
-        states.rotation[frame],
-        states.position[frame],
-        states.angular[frame],
-        states.linear[frame],
-    )
+    every = (states.rotation, states.position, states.angular, states.linear)
+    return tuple(each[frame] for each in every)
 
 
 def _gyroscope(made: _Made, frame: int, rng: np.random.Generator) -> Gyroscope:

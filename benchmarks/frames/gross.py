@@ -40,8 +40,7 @@ def _corner(random: Random, count: int) -> Array:
 
 def _volume(random: Random, count: int) -> Array:
     low, high = (-1.2, -0.9, 1.5), (1.2, 0.9, 3.0)
-    points: Array = random.uniform(low, high, (count, 3))
-    return points
+    return np.asarray(random.uniform(low, high, (count, 3)))
 
 
 def _markers(random: Random, count: int) -> Array:

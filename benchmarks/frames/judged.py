@@ -46,8 +46,7 @@ class Judged:
     reasons: list[str]  # (n,) why there is no pose; empty: there is one
 
     def of(self, name: str) -> Array:
-        column: Array = self.figures[:, FIGURES.index(name)]
-        return column
+        return np.asarray(self.figures[:, FIGURES.index(name)])
 
     @property
     def localized(self) -> NDArray[np.bool_]:
@@ -135,15 +134,11 @@ def camera_of(condition: Condition, variant: int) -> rsl.Camera:
         matrix, distortion = true.matrix, (1.0 - off.distortion) * np.array(true.distortion)
     matrix[:2, 2] += off.centre * direction
     matrix[[0, 1], [0, 1]] *= 1.0 + off.focal * math.copysign(1.0, direction[0])
+    readout_time = true.readout_time if off.readout_time is None else off.readout_time
     return rsl.Camera(
-        width=true.width,
-        height=true.height,
-        K=matrix,
-        D=distortion,
-        distortion_model="plumb_bob",
-        readout_time=true.readout_time if off.readout_time is None else off.readout_time,
+        true.width, true.height, matrix, distortion, readout_time=readout_time,
         scan_direction=str(off.scan or true.scan),
-    )
+    )  # fmt: skip
 
 
 # ns; and a delay (s), scales and a mount (rad) that are known.
@@ -181,24 +176,23 @@ def of_pose(pose: Any, truth: tuple[Array, ...]) -> tuple[float, ...]:
     turn = logarithm(truth[0] @ pose.rotation.T)  # in the axes of the map, as the covariance
     way = truth[1] - pose.position
     return (
-        normalized(np.concatenate([way, turn]), pose.covariance),
-        normalized(turn, pose.covariance[3:, 3:]),
-        normalized(way, pose.covariance[:3, :3]),
-        math.degrees(np.linalg.norm(turn)),
+        *_normalized_parts(way, turn, pose.covariance), math.degrees(np.linalg.norm(turn)),
         1e3 * float(np.linalg.norm(way)),
-    )
+    )  # fmt: skip
 
 
 def of_twist(twist: Any, truth: tuple[Array, ...]) -> list[float]:
     """Squared normalized errors of 6, 3 and 3 dimensions; deg/s and m/s."""
     angular, linear = truth[2] - twist.angular, truth[3] - twist.linear
-    return [
-        normalized(np.concatenate([linear, angular]), twist.covariance),
-        normalized(angular, twist.covariance[3:, 3:]),
-        normalized(linear, twist.covariance[:3, :3]),
-        math.degrees(np.linalg.norm(angular)),
-        float(np.linalg.norm(linear)),
-    ]
+    parts = _normalized_parts(linear, angular, twist.covariance)
+    return [*parts, math.degrees(np.linalg.norm(angular)), float(np.linalg.norm(linear))]
+
+
+def _normalized_parts(way: Array, turn: Array, covariance: Array) -> tuple[float, ...]:
+    return (
+        normalized(np.concatenate([way, turn]), covariance), normalized(turn, covariance[3:, 3:]),
+        normalized(way, covariance[:3, :3]),
+    )  # fmt: skip
 
 
 def normalized(error: Array, covariance: Array) -> float:

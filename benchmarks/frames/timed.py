@@ -192,11 +192,9 @@ def _tracked(localizer: rsl.Localizer, rounds: int) -> Callable[[Frame], object]
 def _poselib(camera: rsl.Camera) -> Callable[[Frame], object]:
     poselib, K = importlib.import_module("poselib"), camera.K
     model = {
-        "model": "PINHOLE",
-        "width": camera.width,
-        "height": camera.height,
+        "model": "PINHOLE", "width": camera.width, "height": camera.height,
         "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
-    }
+    }  # fmt: skip
     return lambda frame: poselib.estimate_absolute_pose(
         frame.pixels, frame.points, model, _OPTIONS, {}
     )

@@ -66,14 +66,11 @@ class Camera:
 
     def exposed(self, pixels: Array) -> Array:
         """Seconds (...) from the first row's exposure to that of raw pixels (...,2)."""
-        along, last = (
-            (pixels[..., 1], self.height - 1)
-            if self.scan in (Scan.DOWN, Scan.UP)
-            else (pixels[..., 0], self.width - 1)
-        )
+        along, last = pixels[..., 0], self.width - 1
+        if self.scan in (Scan.DOWN, Scan.UP):
+            along, last = pixels[..., 1], self.height - 1
         share = along / last if self.scan in (Scan.DOWN, Scan.RIGHT) else 1.0 - along / last
-        delay: Array = self.readout_time * share
-        return delay
+        return np.asarray(self.readout_time * share)
 
     def project_rolling(self, local_at: Callable[[Array], Array], shape: tuple[int, ...]) -> Array:
         """Pixels (*shape,2), each where its point is when its row is exposed.
@@ -100,10 +97,6 @@ class Camera:
         x, y = bearings[..., 0], bearings[..., 1]
         square = x * x + y * y
         radial = 1.0 + square * (k1 + square * (k2 + square * k3))
-        return np.stack(
-            [
-                x * radial + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x),
-                y * radial + p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y,
-            ],
-            axis=-1,
-        )
+        u = x * radial + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x)
+        v = y * radial + p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y
+        return np.stack([u, v], axis=-1)

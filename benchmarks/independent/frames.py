@@ -52,14 +52,9 @@ class Frames:
 
 
 def simulate(
-    camera: Camera,
-    make_motions: MakeMotions,
-    scene: Scene,
-    recordings: int,
-    length: int,
-    seed: int,
-    displaced: Displaced | None = None,
-) -> Frames:
+    camera: Camera, make_motions: MakeMotions, scene: Scene, recordings: int, length: int,
+    seed: int, displaced: Displaced | None = None,
+) -> Frames:  # fmt: skip
     """Recordings of ``length`` frames; time 0 of their motions is the middle of each."""
     rng = np.random.default_rng(seed)
     motions = make_motions(recordings, rng)
@@ -76,26 +71,16 @@ def simulate(
         rotation, position = motions.poses(each, now.ravel())
         there = true if displaced is None else displaced(true, now, which)
         local = np.einsum("nji,nj->ni", rotation, there.reshape(-1, 3) - position)
-        placed: Array = local.reshape(true.shape)
-        return placed
+        return np.asarray(local.reshape(true.shape))
 
     exact = camera.project_rolling(local_at, true.shape[:2])
-    return Frames(
-        camera,
-        which,
-        place,
-        _EPOCH_NS + PERIOD_NS * place,
-        mapped,
-        exact,
-        visible(camera, exact),
-        rng.normal(size=exact.shape),
-        motions.states(which, time),
-        motions.states(which, middle),
-    )
+    stamps, noise = _EPOCH_NS + PERIOD_NS * place, rng.normal(size=exact.shape)
+    states = motions.states(which, time), motions.states(which, middle)
+    shown = visible(camera, exact)
+    return Frames(camera, which, place, stamps, mapped, exact, shown, noise, *states)
 
 
 def first_row_times(camera: Camera, length: int) -> Array:
     """Times (length,) of the first rows (s)."""
     from_middle = np.arange(length) - 0.5 * (length - 1)
-    times: Array = np.asarray(1e-9 * PERIOD_NS * from_middle - 0.5 * camera.readout_time)
-    return times
+    return np.asarray(np.asarray(1e-9 * PERIOD_NS * from_middle - 0.5 * camera.readout_time))

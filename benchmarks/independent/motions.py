@@ -91,14 +91,12 @@ class Motions:
         frequency = self.frequency[which][:, :, None]
         angle = frequency * time[:, None, None] + self.phase[which]
         rate = np.sum(self.amplitude[which] * frequency * np.cos(angle), axis=1)
-        moving: Array = rate + self.steady[which] * self._still_moving(which, time)[:, None]
-        return moving
+        return np.asarray(rate + self.steady[which] * self._still_moving(which, time)[:, None])
 
     def _still_moving(self, which: IntArray, time: Array) -> Array:
         """Share (n,) of the steady velocity that is left: half a cosine from 1 to 0."""
         phase = np.clip((time - self.stop[which]) / self.stopping[which], 0.0, 1.0)
-        left: Array = 0.5 + 0.5 * np.cos(np.pi * phase)
-        return left
+        return np.asarray(0.5 + 0.5 * np.cos(np.pi * phase))
 
     def _travelled(self, which: IntArray, time: Array) -> Array:
         """Its integral, from any instant."""
@@ -107,8 +105,7 @@ class Motions:
         since, duration = time - start, self.stopping[which]
         braking = np.clip(since, 0.0, duration)
         way = 0.5 * braking + duration / (2.0 * np.pi) * np.sin(np.pi * braking / duration)
-        travelled: Array = np.where(never | (since < 0.0), since, way)
-        return travelled
+        return np.asarray(np.where(never | (since < 0.0), since, way))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -216,24 +213,15 @@ def vibration(
     shaking = np.zeros((count, 1, 6))
     swing = np.radians(np.full(count, degrees))
     shaking[:, 0, :3] = swing[:, None] * directions(count, rng)
-    return _motions(
-        count,
-        rng,
-        (
-            np.concatenate([amplitude, shaking], axis=1),
-            np.column_stack([frequency, np.full(count, 2.0 * np.pi * hertz)]),
-        ),
-        in_step=True,
-    )
+    amplitude = np.concatenate([amplitude, shaking], axis=1)
+    frequency = np.column_stack([frequency, np.full(count, 2.0 * np.pi * hertz)])
+    return _motions(count, rng, (amplitude, frequency), in_step=True)
 
 
 def any_vibration(
-    count: int,
-    rng: np.random.Generator,
-    degrees: tuple[float, float],
-    hertz: tuple[float, float],
-    tones: int = 1,
-) -> Motions:
+    count: int, rng: np.random.Generator, degrees: tuple[float, float],
+    hertz: tuple[float, float], tones: int = 1,
+) -> Motions:  # fmt: skip
     """The same by some tones between these limits, one camera another than the next."""
     drawn = [
         np.exp(rng.uniform(math.log(low), math.log(high), (tones, count)))
@@ -287,31 +275,23 @@ def steady(count: int, rng: np.random.Generator, rate: float, speed: float) -> M
 def sudden_stop(count: int, rng: np.random.Generator, earliest: float, latest: float) -> Motions:
     """Cameras that turn and move steadily until they stop, some time between the two (s)."""
     velocities = [_STOPPED_RATE * directions(count, rng), _STOPPED_SPEED * directions(count, rng)]
-    return _motions(
-        count,
-        rng,
-        _no_waves(count),
-        np.column_stack(velocities),
-        (rng.uniform(earliest, latest, count), rng.uniform(*_STOP_SECONDS, count)),
-    )
+    stop = rng.uniform(earliest, latest, count), rng.uniform(*_STOP_SECONDS, count)
+    return _motions(count, rng, _no_waves(count), np.column_stack(velocities), stop)
 
 
 def _with_last_of(first: Motions, others: Sequence[Motions]) -> Motions:
     """Motions with the last sine of others besides."""
-    joined = {
-        name: np.concatenate(
-            [getattr(first, name), *(getattr(other, name)[:, -1:] for other in others)], axis=1
-        )
-        for name in ("amplitude", "frequency", "phase")
-    }
+    joined = {}
+    for name in ("amplitude", "frequency", "phase"):
+        last = (getattr(other, name)[:, -1:] for other in others)
+        joined[name] = np.concatenate([getattr(first, name), *last], axis=1)
     return replace(first, **joined)
 
 
 def directions(count: int, rng: np.random.Generator) -> Array:
     """Unit vectors (count,3) of any direction."""
     vectors = rng.normal(size=(count, 3))
-    unit: Array = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    return unit
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
 def _no_waves(count: int) -> tuple[Array, Array]:
@@ -330,13 +310,9 @@ def _waves(
 
 
 def _motions(
-    count: int,
-    rng: np.random.Generator,
-    waves: tuple[Array, Array],
-    steady: Array | None = None,
-    stop: tuple[Array, Array] | None = None,
-    in_step: bool = False,
-) -> Motions:
+    count: int, rng: np.random.Generator, waves: tuple[Array, Array], steady: Array | None = None,
+    stop: tuple[Array, Array] | None = None, in_step: bool = False,
+) -> Motions:  # fmt: skip
     """From any first pose.
 
     Args:
@@ -352,13 +328,7 @@ def _motions(
     phase = rng.uniform(0.0, 2.0 * np.pi, amplitude.shape)
     if in_step:
         phase[:, -1] = phase[:, -1, :1]
-    return Motions(
-        exponential(rng.uniform(0.0, 3.0, (count, 1)) * directions(count, rng)),
-        rng.uniform(-3.0, 3.0, (count, 3)),
-        amplitude,
-        frequency,
-        phase,
-        np.zeros((count, 6)) if steady is None else steady,
-        when,
-        braking,
-    )
+    rotation = exponential(rng.uniform(0.0, 3.0, (count, 1)) * directions(count, rng))
+    position = rng.uniform(-3.0, 3.0, (count, 3))
+    steady = np.zeros((count, 6)) if steady is None else steady
+    return Motions(rotation, position, amplitude, frequency, phase, steady, when, braking)

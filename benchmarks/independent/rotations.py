@@ -29,26 +29,18 @@ def exponential(vector: Array) -> Array:
     safe = np.where(small, 1.0, angle)
     first = np.where(small, 1.0 - angle**2 / 6.0, np.sin(safe) / safe)
     second = np.where(small, 0.5 - angle**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
-    turned: Array = np.eye(3) + first * cross + second * (cross @ cross)
-    return turned
+    return np.asarray(np.eye(3) + first * cross + second * (cross @ cross))
 
 
 def logarithm(rotation: Array) -> Array:
     """Vectors (...,3) of rotations (...,3,3) by less than half a turn."""
-    skew = np.stack(
-        [
-            rotation[..., 2, 1] - rotation[..., 1, 2],
-            rotation[..., 0, 2] - rotation[..., 2, 0],
-            rotation[..., 1, 0] - rotation[..., 0, 1],
-        ],
-        axis=-1,
-    )  # 2 sin(angle) axis
+    twice = rotation - np.swapaxes(rotation, -1, -2)
+    skew = twice[..., [2, 0, 1], [1, 2, 0]]  # 2 sin(angle) axis
     sine = 0.5 * np.linalg.norm(skew, axis=-1)
     angle = np.arctan2(sine, 0.5 * (np.trace(rotation, axis1=-2, axis2=-1) - 1.0))
     small = sine < _SMALL
     factor = np.where(small, 0.5 + sine**2 / 12.0, 0.5 * angle / np.where(small, 1.0, sine))
-    vector: Array = factor[..., None] * skew
-    return vector
+    return np.asarray(factor[..., None] * skew)
 
 
 def body_rate(vector: Array, rate: Array) -> Array:
@@ -61,10 +53,8 @@ def body_rate(vector: Array, rate: Array) -> Array:
     first = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
     second = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
     jacobian = np.eye(3) - first * cross + second * (cross @ cross)
-    body: Array = (jacobian @ rate[..., None])[..., 0]
-    return body
+    return np.asarray((jacobian @ rate[..., None])[..., 0])
 
 
 def _angle(vector: Array) -> Array:
-    angle: Array = np.linalg.norm(vector, axis=-1)[..., None, None]
-    return angle
+    return np.asarray(np.linalg.norm(vector, axis=-1)[..., None, None])

@@ -60,13 +60,9 @@ Scene = Rich | Wall | SmallPlane | Board
 
 
 def points(
-    scene: Scene,
-    camera: Camera,
-    motions: Moving,
-    which: IntArray,
-    middle: Array,
+    scene: Scene, camera: Camera, motions: Moving, which: IntArray, middle: Array,
     rng: np.random.Generator,
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array]:  # fmt: skip
     """Points (f,n,3) of each frame: as they are, and as the map has them.
 
     ``which`` (f,) tells the motion of each frame, ``middle`` (f,) the time of its middle row.
@@ -84,13 +80,9 @@ def points(
 
 
 def _in_view(
-    scene: Rich | Wall,
-    camera: Camera,
-    motions: Moving,
-    which: IntArray,
-    middle: Array,
+    scene: Rich | Wall, camera: Camera, motions: Moving, which: IntArray, middle: Array,
     rng: np.random.Generator,
-) -> Array:
+) -> Array:  # fmt: skip
     """Points behind random pixels of the middle row's instant."""
     shape = (len(which), scene.points)
     size = np.array([camera.width, camera.height]) - 1.0
@@ -106,8 +98,7 @@ def _in_view(
         height = np.einsum("fi,fi->f", normal, centre[which] - position)
         # Where a ray passes the wall by, the point lies behind the camera and is not seen.
         depth = height[:, None] / np.einsum("fi,fni->fn", normal, in_map)
-    placed: Array = position[:, None] + depth[..., None] * in_map
-    return placed
+    return np.asarray(position[:, None] + depth[..., None] * in_map)
 
 
 def _pattern(
@@ -134,10 +125,9 @@ def _placed(
     count = len(motions)
     distance = _WALL_DISTANCE if isinstance(scene, Wall) else scene.distance
     tilt = _WALL_TILT if isinstance(scene, Wall) else math.radians(scene.tilt)
+    tilts = np.full((count, 1), tilt)
     if not isinstance(scene, SmallPlane):
         tilts = rng.uniform(0.0, tilt, (count, 1))
-    else:
-        tilts = np.full((count, 1), tilt)
     around = rng.uniform(0.0, 2.0 * np.pi, count)
     axis = np.column_stack([np.cos(around), np.sin(around), np.zeros(count)])
     spin = np.zeros((count, 3))
@@ -151,5 +141,4 @@ def _placed(
 def visible(camera: Camera, pixels: Array) -> BoolArray:
     """Which pixels (...,2) lie in the image, and stay there under noise."""
     size = np.array([camera.width, camera.height]) - 1.0
-    inside: BoolArray = np.all((pixels >= _MARGIN) & (pixels <= size - _MARGIN), axis=-1)
-    return inside
+    return np.asarray(np.all((pixels >= _MARGIN) & (pixels <= size - _MARGIN), axis=-1))

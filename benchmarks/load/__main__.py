@@ -13,7 +13,7 @@ import sys
 
 import numpy as np
 
-from benchmarks.load.frames import simulated
+from benchmarks.load.camera import simulated
 from benchmarks.load.measuring import Result, steady
 from rs_localizer.cli.options import integer, number
 

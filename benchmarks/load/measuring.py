@@ -25,8 +25,7 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from benchmarks.load.camera import Camera
-from benchmarks.load.frames import READOUT_TIME, Frames
+from benchmarks.load.camera import READOUT_TIME, Camera, Frames
 from rs_localizer.core.arrays import Array
 from rs_localizer.io import topics
 from rs_localizer.ros.node.managed import executor_of

@@ -24,7 +24,7 @@ from benchmarks.real.clips import clips_of, opencv_lens, shutter_of
 from benchmarks.real.judging import METHODS, judged
 from benchmarks.real.peers import PEERS
 from benchmarks.real.recordings import add_settings
-from rs_localizer.cli.settings_args import given_settings
+from rs_localizer.cli.recording_input import given_settings
 
 
 def main(argv: Sequence[str]) -> int:

@@ -128,11 +128,9 @@ def shutter_of(clip: Clip, cache: Path) -> Shutter:
     found = json.loads(file.read_text(encoding="utf-8"))
     known = found["readout_time"] > 1e-3
     return Shutter(
-        found["readout_time"] if known else _PHONE,
-        0.0 if known else _PHONE_DEVIATION,
-        found["direction"] if known else "top_to_bottom",
-        found["verdict"],
-    )
+        found["readout_time"] if known else _PHONE, 0.0 if known else _PHONE_DEVIATION,
+        found["direction"] if known else "top_to_bottom", found["verdict"],
+    )  # fmt: skip
 
 
 def _calibrated(clip: Clip) -> dict[str, object]:

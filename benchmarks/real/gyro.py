@@ -14,7 +14,6 @@ shutter have some, too:
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,11 +22,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks import command
 from benchmarks.experiments.results import Table
 from benchmarks.real.gyroscopes import Gyroscope, aligned, best_offset, in_images
 from benchmarks.real.peers import PEERS, GlobalPose, solve_pnp_ransac
 from benchmarks.real.recordings import Recording, add_settings, read_bag
-from rs_localizer.cli.settings_args import given_settings
+from rs_localizer.cli.recording_input import given_settings
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
@@ -127,10 +127,14 @@ def _row(
         claimed = np.sqrt(np.mean(np.trace(covariances, axis1=1, axis2=2)))
         ratio = float(claimed / np.sqrt(np.mean(np.sum(errors**2, axis=1))))
         inside = float(np.mean(squared < _INSIDE))
+    places = [k for k in poses if k + 1 in poses]
+    mean = gyroscope.mean_rate(times[places], times[np.array(places, int) + 1])
+    between = np.array([_rate(poses, times, k, k + 1) for k in places]) - mean
+    places = [k for k in poses if k - 1 in poses and k + 1 in poses]
+    central = np.array([_rate(poses, times, k - 1, k + 1) for k in places]) - truth[places]
     return Row(
-        len(poses), _turns(poses, times, gyroscope), _central(poses, times, truth), twist,
-        float(np.rad2deg(claimed)), ratio, inside,
-        float(np.mean(list(near.values()))),
+        len(poses), _spread(between), _spread(central), twist, float(np.rad2deg(claimed)), ratio,
+        inside, float(np.mean(list(near.values()))),
         float(np.mean([value for k, value in near.items() if is_fast[k]])),
     )  # fmt: skip
 
@@ -181,23 +185,9 @@ def rates_of(estimates: Mapping[int, Estimate], readout_time: float) -> tuple[Ar
     return rates, covariances / readout_time**2
 
 
-def _turns(poses: Poses, times: Array, gyroscope: Gyroscope) -> tuple[float, float]:
-    """Errors of the mean turn rate between neighbours: median and 95 %, deg/s."""
-    places = [k for k in poses if k + 1 in poses]
-    true = gyroscope.mean_rate(times[places], times[np.array(places, int) + 1])
-    return _spread(np.array([_rate(poses, times, k, k + 1) for k in places]) - true)
-
-
-def _central(poses: Poses, times: Array, truth: Array) -> tuple[float, float]:
-    """Errors of central differences as the turn rate of the image: median and 95 %, deg/s."""
-    places = [k for k in poses if k - 1 in poses and k + 1 in poses]
-    return _spread(np.array([_rate(poses, times, k - 1, k + 1) for k in places]) - truth[places])
-
-
 def _rate(poses: Poses, times: Array, first: int, last: int) -> Array:
     turn = so3.log(np.ascontiguousarray(poses[first].rotation @ poses[last].rotation.T))
-    rate: Array = turn / (times[last] - times[first])
-    return rate
+    return np.asarray(turn / (times[last] - times[first]))
 
 
 def _spread(errors: Array) -> tuple[float, float]:
@@ -274,10 +264,7 @@ def draw(judged: Judged, gyroscope: Gyroscope, readout_time: float, file: Path) 
 
 def main(argv: Sequence[str]) -> None:
     """Run it."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.real gyro", description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    parser = command(".real gyro", __doc__)
     parser.add_argument("recording", type=Path, help="a bag")
     parser.add_argument("--gyroscope", type=Path, required=True, help="t wx wy wz, held back")
     parser.add_argument("--align", action="store_true", help="find its clock, axes and bias")

@@ -48,8 +48,7 @@ class Gyroscope:
         def at(time: Array) -> Array:
             return np.stack([np.interp(time, self.times, angles[:, k]) for k in range(3)], axis=1)
 
-        rate: Array = (at(last) - at(first)) / (last - first)[:, None]
-        return rate
+        return np.asarray((at(last) - at(first)) / (last - first)[:, None])
 
 
 def aligned(gyroscope: Gyroscope, recording: Recording) -> tuple[Gyroscope, str]:
@@ -83,8 +82,7 @@ def aligned(gyroscope: Gyroscope, recording: Recording) -> tuple[Gyroscope, str]
 
     def errors(numbers: Array) -> Array:
         turned = Rotation.from_rotvec(numbers[1:4]).apply(rates(numbers[0]) - numbers[4:])
-        off: Array = (turned - seen).ravel()
-        return off
+        return np.asarray((turned - seen).ravel())
 
     noise = max(float(np.median(np.abs(errors(np.r_[offset, axes.as_rotvec(), 0, 0, 0])))), 1e-4)
     found = least_squares(

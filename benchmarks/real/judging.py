@@ -128,9 +128,7 @@ def _twists(clip: Clip, poses: Poses, peer: Poses, readout_time: float) -> dict[
         of_rate = (before.turn_covariance + after.turn_covariance) / seconds**2
         spread = here.covariance[ANGULAR, ANGULAR] / readout_time**2 + of_rate
         inside.append(error @ np.linalg.solve(spread, error) < _INSIDE_3)
-    if not inside:
-        return {}
-    return {"twist_inside": float(np.mean(inside))}
+    return {"twist_inside": float(np.mean(inside))} if inside else {}
 
 
 def _halves(camera: Camera, images: Sequence[ImagePoints], config: NodeConfig) -> dict[str, float]:
@@ -181,12 +179,8 @@ def _agreement(ones: Poses, others: Poses) -> dict[str, float]:
     for one, other in zip(ones, others, strict=True):
         if not (isinstance(one, Estimate) and isinstance(other, Estimate)):
             continue
-        step = np.concatenate(
-            [
-                so3.log(one.rotation @ other.rotation.T),
-                one.rotation @ (other.position - one.position),
-            ]
-        )
+        move = one.rotation @ (other.position - one.position)
+        step = np.concatenate([so3.log(one.rotation @ other.rotation.T), move])
         first, _ = _at_known_motion(one)
         second, gain = _at_known_motion(other)
         step = step + gain @ (_motion(one) - _motion(other))
@@ -195,11 +189,8 @@ def _agreement(ones: Poses, others: Poses) -> dict[str, float]:
         turns.append(step[:3] @ np.linalg.solve(spread[:3, :3], step[:3]))
     if not inside:
         return {"halves": 0}
-    return {
-        "halves": len(inside),
-        "inside": float(np.mean(inside)),
-        "turn_claimed": math.sqrt(_MEDIAN / np.median(turns)),
-    }
+    claimed = math.sqrt(_MEDIAN / np.median(turns))
+    return {"halves": len(inside), "inside": float(np.mean(inside)), "turn_claimed": claimed}
 
 
 def _motion(estimate: Estimate) -> Array:

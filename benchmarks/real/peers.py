@@ -30,8 +30,7 @@ class GlobalPose(Motion):
     @property
     def position(self) -> Array:
         """Camera centre (3,) in the map frame, m."""
-        centre: Array = -self.rotation.T @ self.translation
-        return centre
+        return np.asarray(-self.rotation.T @ self.translation)
 
     def __bool__(self) -> Literal[True]:
         return True
@@ -71,18 +70,12 @@ def poselib(camera: Camera, points: Array, pixels: Array) -> GlobalPose | None:
     lens = np.zeros(4)
     lens[: min(len(camera.D), 4)] = camera.D[:4]
     K = camera.K
-    pose, found = library.estimate_absolute_pose(
-        pixels,
-        points,
-        {
-            "model": "OPENCV",
-            "width": camera.width,
-            "height": camera.height,
-            "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens],
-        },
-        {"max_reproj_error": _THRESHOLD},
-        {},
-    )
+    model = {
+        "model": "OPENCV", "width": camera.width, "height": camera.height,
+        "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens],
+    }  # fmt: skip
+    limits = {"max_reproj_error": _THRESHOLD}
+    pose, found = library.estimate_absolute_pose(pixels, points, model, limits, {})
     inliers = np.asarray(found["inliers"], np.bool_)
     if inliers.sum() < _FEWEST:
         return None
@@ -114,11 +107,7 @@ def _pose(
     by_pose = slopes[:, :6].reshape(-1, 2, 6)[chosen].reshape(-1, 6)
     freedom = max(len(by_pose) - 6, 1)
     variance = float(np.sum(errors[chosen] ** 2)) / freedom
-    return GlobalPose(
-        rotation=np.asarray(cv2.Rodrigues(turn)[0], float),
-        translation=np.asarray(move, float).ravel(),
-        angular_velocity=np.zeros(3),
-        linear_velocity=np.zeros(3),
-        residuals=np.linalg.norm(errors, axis=1),
-        turn_covariance=variance * np.linalg.inv(by_pose.T @ by_pose)[:3, :3],
-    )
+    rotation, translation = cv2.Rodrigues(turn)[0], np.asarray(move, float).ravel()
+    covariance = variance * np.linalg.inv(by_pose.T @ by_pose)[:3, :3]
+    residuals, rest = np.linalg.norm(errors, axis=1), (np.zeros(3), np.zeros(3))
+    return GlobalPose(np.asarray(rotation, float), translation, *rest, residuals, covariance)

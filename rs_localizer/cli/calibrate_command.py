@@ -8,6 +8,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,9 +23,10 @@ from rs_localizer.cli.recording_input import (
     check_there,
     each_image,
     find_map,
+    given_settings,
     recorded,
+    remapped,
 )
-from rs_localizer.cli.settings_args import given_settings, remapped
 from rs_localizer.io.topics import CAMERA_INFO, IMAGE, IMU
 
 if WORKING:
@@ -50,7 +52,7 @@ if WORKING:
     from rs_localizer.tools.adjust.observe import ImagePoints, in_order
     from rs_localizer.tools.camera_calibration import CameraCalibration, calibrate
     from rs_localizer.tools.first_lens import first_lens
-    from rs_localizer.tools.rig_mounts import Mounted, Recording, calibrate_rig
+    from rs_localizer.tools.rig_mounts import calibrate_rig
 
 # Names of the files beside FILE.yaml, after FILE_.
 _MAP, _TRANSFORMS = "map.yaml", "transforms.launch.xml"
@@ -96,7 +98,7 @@ class _Input:
 
 
 def run(options: Options) -> Mapping[str, object]:
-    out, beside = options.out, list[Path]()
+    out = options.out
     if out is not None and out.suffix not in (".yaml", ".yml"):
         raise UsageError(f"--out must end in .yaml, got {out}")
     if options.camera_info is not None and out is None:
@@ -106,20 +108,17 @@ def run(options: Options) -> Mapping[str, object]:
             raise UsageError("--imu is for one camera: leave it out with --rig")
         # Cameras by name need a readout time; what it is does not matter where it is estimated.
         options = replace(options, assignments=["readout_time:=0.03", *options.assignments])
-        config = given_settings(options)
+    elif len(options.recordings) > 1:
+        raise UsageError("several recordings are those of a --rig")
+    config = given_settings(options)
+    cameras = {"": (replace(options, recording=options.recordings[0]), "")}
+    if options.rig:
         cameras = cameras_of(options, options.recordings, config)
-    else:
-        if len(options.recordings) > 1:
-            raise UsageError("several recordings are those of a --rig")
-        config = given_settings(options)
-        cameras = {"": (replace(options, recording=options.recordings[0]), "")}
     if out is not None:
-        if options.rig:
-            beside = [_beside(out, _TRANSFORMS)]
-        elif options.map is not None or options.board is not None:
+        beside = [_beside(out, _TRANSFORMS)] if options.rig else []
+        if not options.rig and (options.map is not None or options.board is not None):
             beside = [_beside(out, _MAP)]
-        lenses = _lens_files(options, cameras).values()
-        refuse_existing(options, out, *beside, *lenses)
+        refuse_existing(options, out, *beside, *_lens_files(options, cameras).values())
     sources, found = dict[str, _Input](), dict[str, CameraCalibration]()
     for name, (own, _) in cameras.items():
         if name:
@@ -164,11 +163,8 @@ def _lens_files(args: Options, names: Iterable[str]) -> dict[str, Path]:
 
 
 def _lens_writers(args: Options, cameras: Mapping[str, Camera]) -> Writers:
-    """Return what writes the single lenses, if they are wanted."""
-    return {
-        file: partial(write_calibration, camera=cameras[name])
-        for name, file in _lens_files(args, cameras).items()
-    }
+    files = _lens_files(args, cameras)
+    return {files[name]: partial(write_calibration, camera=cameras[name]) for name in files}
 
 
 def _calibrated(args: Options, source: _Input, config: NodeConfig) -> CameraCalibration:
@@ -187,22 +183,19 @@ def _calibrated(args: Options, source: _Input, config: NodeConfig) -> CameraCali
 
 
 def _read(args: Options, config: NodeConfig) -> _Input:
-    path = args.recording
+    path, topics = args.recording, remapped(args)
     check_there([path])
     of_bag, imu = is_bag(path), None
-    if args.imu:
-        if not of_bag:
-            raise UsageError("--imu is for bags, which have an IMU beside the images")
-        with open_bag(path) as bag:
-            topics = remapped(args)
+    if args.imu and not of_bag:
+        raise UsageError("--imu is for bags, which have an IMU beside the images")
+    with open_bag(path) if of_bag else nullcontext() as bag:
+        if bag is not None and args.imu:
             frame = optical_frame(bag, topics.get(CAMERA_INFO))
             imu = read_imu_recording(bag, topics.get(IMU), frame)
-    if of_bag and IMAGE not in remapped(args):
-        with open_bag(path) as bag:
-            if has_frames(bag):
-                if args.rate is not None:
-                    raise UsageError("--rate is for images; a bag has its own times")
-                return replace(_correspondences(args, bag, config), imu=imu)
+        if bag is not None and IMAGE not in topics and has_frames(bag):
+            if args.rate is not None:
+                raise UsageError("--rate is for images; a bag has its own times")
+            return replace(_correspondences(args, bag, config), imu=imu)
     own_stamps = of_bag or (path.is_dir() and args.rate is None)
     return replace(_detected(args), own_stamps=own_stamps, imu=imu)
 
@@ -246,7 +239,7 @@ def _write(
     Returns:
         ``refused``, with what was written in spite of it.
     """
-    shape, marker_map = args.map, source.map
+    shape, marker_map, camera = args.map, source.map, found.fit.camera
     values: dict[str, Any] = {"scan_direction": config.scan_direction}
     if not refused:
         values = {
@@ -260,10 +253,10 @@ def _write(
         values["stamp_offset"] = config.stamp_offset
     writers = Writers()
     if marker_map is not None:
-        if verdict.shape_is_free(found):
+        if free := verdict.shape_is_free(found):
             places = verdict.moved(found, marker_map.points)
             marker_map = marker_map.with_points(places, found.shape_deviation)
-        if verdict.shape_is_free(found) or shape is None:
+        if free or shape is None:
             shape = _beside(out, _MAP)
             writers[shape] = partial(write_marker_map, marker_map=marker_map)
     if refused and not writers and not source.find_lens:
@@ -272,7 +265,6 @@ def _write(
         [found] if source.find_lens else [], [] if marker_map is None else [marker_map], config
     )
     remarks = [f"readout_time {refused}"] if refused else []
-    camera = found.fit.camera
     lens = lens_parameters(camera)
     write = partial(write_parameters, values=values, lens=lens, remarks=remarks)
     write_all({**writers, **_lens_writers(args, {"": camera}), out: write})
@@ -321,8 +313,7 @@ def _mount(
     """Find how cameras that are calibrated are mounted on a rig, print it and write it."""
     if refusals := [f"{n}: {text}" for n, one in found.items() if (text := verdict.refusal(one))]:
         raise ValueError("; ".join(refusals))
-    recordings = {name: Recording(sources[name].camera, one) for name, one in found.items()}
-    rig, comments = calibrate_rig(recordings), list[str]()
+    rig, comments = calibrate_rig(found), list[str]()
     first, *others = rig
     for name in others:
         comments += verdict.of_mount(name, first, rig[name])
@@ -333,29 +324,25 @@ def _mount(
         return
     alone = list(found.values()) if any(one.find_lens for one in sources.values()) else []
     maps = [one.map for one in sources.values() if one.map is not None]
-    parts = _parts(rig, found, config)
-    values = rigs.node_parameters(parts) | _deviations(alone, maps, config)
-    place, lens = _beside(args.out, _TRANSFORMS), rigs.mounted_lenses(parts)
-    write_all({
-        place: partial(rigs.write_static_transforms, parts=parts, frames=frames),
-        **_lens_writers(args, parts.cameras),
-        args.out: partial(write_parameters, values=values, lens=lens, remarks=comments),
-    })  # fmt: skip
-    when = "next" if shutil.which("ros2") else "next, in a ROS 2 workspace"
-    print(f"{when}: {shlex.join(['ros2', 'launch', str(place)])}")
-
-
-def _parts(
-    rig: Mapping[str, Mounted], found: Mapping[str, CameraCalibration], config: NodeConfig
-) -> RigParts:
-    """Return the estimated rig in the axes of its first camera and by its clock."""
     cameras = {}
     for name, one in rig.items():
         known = 0.0 if found[name].global_shutter else abs(one.readout_time)
         direction = verdict.scan_direction(found[name])
         cameras[name] = replace(one.camera, readout_time=known, scan_direction=direction)
+    # In the axes of the first camera and by its clock.
     mounts = {name: one.extrinsics for name, one in rig.items()}
-    poses = {name: (own.axes, -own.axes @ own.centre) for name, own in mounts.items()}
-    base = config.of_cameras.get(next(iter(rig)), config).stamp_offset
-    offsets = {name: base + own.offset for name, own in mounts.items()}
-    return RigParts(cameras, poses, offsets)
+    base = config.of_cameras.get(first, config).stamp_offset
+    parts = RigParts(
+        cameras,
+        {name: (own.axes, -own.axes @ own.centre) for name, own in mounts.items()},
+        {name: base + own.offset for name, own in mounts.items()},
+    )
+    values = rigs.node_parameters(parts) | _deviations(alone, maps, config)
+    place, lens = _beside(args.out, _TRANSFORMS), rigs.mounted_lenses(parts)
+    write_all({
+        place: partial(rigs.write_static_transforms, parts=parts, frames=frames),
+        **_lens_writers(args, cameras),
+        args.out: partial(write_parameters, values=values, lens=lens, remarks=comments),
+    })  # fmt: skip
+    when = "next" if shutil.which("ros2") else "next, in a ROS 2 workspace"
+    print(f"{when}: {shlex.join(['ros2', 'launch', str(place)])}")

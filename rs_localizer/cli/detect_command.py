@@ -19,8 +19,7 @@ from rs_localizer.cli.recording_input import (
     cameras_of,
     find_map,
     opened,
-    print_left_out,
-    print_times,
+    print_images,
     shutter_values,
 )
 from rs_localizer.config import DetectorConfig, FeatureConfig, FeatureKind
@@ -98,15 +97,25 @@ def detect(args: Options) -> Figures:
                         shots = (shot for shot in shots if not isinstance(shot, Carried))
                     options = offline.DetectionOptions(args.with_images, of.scan_direction, name)
                     found = detect_images(shots, bag, options, bar)
-                every.append(_figures(args, found))
-                print(f"{f'{args.out}, {name}' if name else args.out}: {_summary(args, found)}")
+                count, median = len(found.counts), float(np.median(found.counts))
+                kind = "keypoints" if args.features else "corners"
+                figures: Figures = {"images": found.images, f"with_{kind}": count, kind: median}
+                if not args.features:
+                    figures["residual_of_a_still_pose_px"] = found.residual
+                every.append(figures)
+                kind += f" ({args.features})" if args.features else ""
+                said = f"{count} of {found.images} images, {median:.0f} {kind} each (median)"
+                if np.isfinite(found.residual):
+                    said += (
+                        f", within {found.residual:.3f} px rms of a global-shutter pose (median)"
+                    )
+                print(f"{f'{args.out}, {name}' if name else args.out}: {said}")
                 print("".join(f"note {note}\n" for note in found.notes), end="")
-                print_left_out(found.refused)
                 if kept := [f"{topic} ({count})" for topic, count in found.carried.items()]:
                     print(f"kept for replay: {', '.join(kept)}")
                 for fault in found.faults:
                     print(f"warning: {fault}")
-                print_times(source.clock, of.readout_time, found.period)
+                print_images(found.refused, source.clock, of.readout_time, found.period)
                 warnings += found.faults
         if values := {**of_map, **shutter_values(args)}:
             write_parameters(out / PARAMETERS, values)
@@ -119,24 +128,6 @@ _WORST: dict[str, Any] = {
     "images": sum, "with_corners": sum, "corners": min, "residual_of_a_still_pose_px": max,
     "with_keypoints": sum, "keypoints": min,
 }  # fmt: skip
-
-
-def _figures(args: Options, found: Extraction) -> Figures:
-    kind = "corners" if args.features is None else "keypoints"
-    count, median = len(found.counts), float(np.median(found.counts))
-    figures: Figures = {"images": found.images, f"with_{kind}": count, kind: median}
-    if not args.features:
-        figures["residual_of_a_still_pose_px"] = found.residual
-    return figures
-
-
-def _summary(args: Options, found: Extraction) -> str:
-    kind = f"keypoints ({args.features})" if args.features else "corners"
-    median = f"{np.median(found.counts):.0f} {kind} each (median)"
-    said = f"{len(found.counts)} of {found.images} images, {median}"
-    if np.isfinite(found.residual):
-        said += f", within {found.residual:.3f} px rms of a global-shutter pose (median)"
-    return said
 
 
 Detection = Callable[["Shots", BagWriter, "offline.DetectionOptions", Any], "Extraction"]

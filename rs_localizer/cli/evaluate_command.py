@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rs_localizer.cli import WORKING, write_all
 from rs_localizer.cli.options import argument, option
-from rs_localizer.cli.settings_args import remapped
+from rs_localizer.cli.recording_input import remapped
 from rs_localizer.io.bags import BagError, open_bag
 from rs_localizer.io.recording import CORRESPONDENCES_TOPIC, IMAGE_TOPIC, RAW_IMAGE_TOPIC
 

@@ -39,10 +39,7 @@ def argument(help: str, metavar: str, default: Any = MISSING) -> Any:  # noqa: A
         metavar: its name in the help.
         default: makes it optional; ``list``: none or more.
     """
-    about = {"help": help, "metavar": metavar, "positional": True}
-    if default is list:
-        return field(default_factory=list, metadata=about)
-    return field(metadata=about) if default is MISSING else field(default=default, metadata=about)
+    return _field(default, {"help": help, "metavar": metavar, "positional": True})
 
 
 def option(
@@ -65,14 +62,16 @@ def option(
         default: ``list`` for one that may be repeated; of a switch, False.
         flag: another name, such as ``-p``, or several.
         choices: of a text.
-        least: of a number.
-        most: likewise.
-        above: what a number is more than.
+        least, most, above: limits of a number, which is more than the last.
         required: there is no default.
     """
-    about: dict[str, Any] = {"help": help, "metavar": metavar, "flag": flag}
-    about |= {"choices": tuple(choices)}
-    about |= {"limits": (least, most, above), "required": required, "positional": False}
+    return _field(default, {
+        "help": help, "metavar": metavar, "flag": flag, "choices": tuple(choices),
+        "limits": (least, most, above), "required": required, "positional": False,
+    })  # fmt: skip
+
+
+def _field(default: Any, about: dict[str, Any]) -> Any:
     if default is list:
         return field(default_factory=list, metadata=about)
     return field(default=default, metadata=about)
@@ -93,11 +92,9 @@ class TopicOptions:
     """topics of the recording (found by name and type)."""
 
     remaps: list[str] = option(
-        "another topic of an input: -r imu:=/imu/data; may be repeated",
-        "INPUT:=TOPIC",
-        list,
+        "another topic of an input: -r imu:=/imu/data; may be repeated", "INPUT:=TOPIC", list,
         flag="-r",
-    )
+    )  # fmt: skip
     # No option: what is read, of one of several cameras.
     recording: Path = Path()
 
@@ -115,14 +112,12 @@ class FleetOptions:
 
     workers: int | None = option(
         "recordings at a time, each in a process of its own (pip install 'rs_localizer[fleet]')",
-        "N",
-        least=1,
-    )
+        "N", least=1,
+    )  # fmt: skip
     scheduler: str | None = option(
         "instead: the workers of a Dask scheduler, such as tcp://host:8786, which see these files "
-        "(pip install 'rs_localizer[fleet]')",
-        "ADDRESS",
-    )
+        "(pip install 'rs_localizer[fleet]')", "ADDRESS",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,16 +169,13 @@ def _add(group: argparse._ActionsContainer, kind: type[Any], item: Any) -> None:
     if one is bool:
         words["action"] = "store_true"
     else:
-        words["metavar"] = about["metavar"] or None
-        limits = about.get("limits", ())
-        words["type"] = {
-            float: number(*limits), int: integer(*limits), Path: path, str: str
-        }.get(one, one)  # fmt: skip
+        limits, words["metavar"] = about.get("limits", ()), about["metavar"] or None
+        types = {float: number(*limits), int: integer(*limits), Path: path}
+        words["type"] = types.get(one, one)
         if about.get("choices"):
             words["choices"] = about["choices"]
         if isinstance(many, int):
-            words["nargs"] = many
-            words["metavar"] = tuple(about["metavar"].split())
+            words |= {"nargs": many, "metavar": tuple(about["metavar"].split())}
         elif many is list and about["metavar"].endswith("..."):
             words |= {"nargs": "+", "metavar": about["metavar"].removesuffix(" ...")}
     if about["positional"]:
@@ -193,15 +185,13 @@ def _add(group: argparse._ActionsContainer, kind: type[Any], item: Any) -> None:
             words |= {"nargs": "?", "default": item.default}
         group.add_argument(name, **words)
         return
-    flag = about["flag"] or f"--{name.replace('_', '-')}"
-    if repeated:
-        words |= {"action": "append", "default": []}
-    elif many is list:
-        words["default"] = []
+    if many is list or repeated:
+        words |= {"default": []} | ({"action": "append"} if repeated else {})
     elif one is not bool:
         words |= {"default": item.default, "required": about["required"]}
         if item.default is not None:
             words["help"] += f" (default: {item.default})"
+    flag = about["flag"] or f"--{name.replace('_', '-')}"
     group.add_argument(*flag.split(), dest=name, **words)
 
 
@@ -240,12 +230,15 @@ def path(text: str) -> Path:
 
 
 def number(
-    least: float = -math.inf,
-    most: float = math.inf,
-    above: float = -math.inf,
+    least: float = -math.inf, most: float = math.inf, above: float = -math.inf,
     kind: type[float] | type[int] = float,
-) -> Callable[[str], float]:
+) -> Callable[[str], float]:  # fmt: skip
     """Return a parser of finite numbers in a range, for ``add_argument(type=...)``."""
+    wanted = f"must be more than {above:g}"
+    if math.isfinite(least):
+        wanted = f"must be {least:g} or more"
+    if math.isfinite(most):
+        wanted = f"must lie between {least:g} and {most:g}"
 
     def parse(text: str) -> float:
         try:
@@ -256,11 +249,6 @@ def number(
             what = "a whole number" if kind is int else "a number"
             raise argparse.ArgumentTypeError(f"must be {what}, got {text!r}")
         if not least <= value <= most or value <= above:
-            wanted = f"must be more than {above:g}"
-            if math.isfinite(least):
-                wanted = f"must be {least:g} or more"
-            if math.isfinite(most):
-                wanted = f"must lie between {least:g} and {most:g}"
             raise argparse.ArgumentTypeError(f"{wanted}, got {text}")
         return value
 

@@ -1,25 +1,24 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Inputs of commands: images or a bag, their camera or cameras, and the targets in them."""
+"""Inputs of commands: settings, images or a bag, their cameras, and the targets in them."""
 
 from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from rs_localizer.cli import WORKING, read_counts
 from rs_localizer.cli.options import SettingOptions, TopicOptions, UsageError, option
-from rs_localizer.cli.settings_args import given_topics, given_values, remapped
 from rs_localizer.io.camera_files import CALIBRATION_KINDS, read_calibration
 from rs_localizer.io.image_clock import ImageClock, readout_fault
 from rs_localizer.io.recording import PARAMETERS
 from rs_localizer.io.topics import CAMERA_INFO, IMAGE, IMU
-from rs_localizer.pipeline.inputs import CAMERA_INFO_TYPE, IMAGE_TYPES
-from rs_localizer.settings import camera_values
+from rs_localizer.pipeline.inputs import CAMERA_INFO_TYPE, IMAGE_TYPES, INPUTS
+from rs_localizer.settings import build, camera_values, load_params_file, parse_assignment
 
 if WORKING:
     import numpy as np
@@ -69,6 +68,55 @@ class ImageOptions(LensOptions):
     )  # fmt: skip
 
 
+def given_values(args: Any) -> dict[str, Any]:
+    """Return the values of a camera's file, a params file and ``-p``, each over those before.
+
+    Args:
+        args: with ``params`` and ``assignments``, and ``calibration`` where there is a lens.
+
+    Raises:
+        UsageError: for an unknown setting, or a wrong value, with its source.
+    """
+    lens, values = getattr(args, "calibration", None), dict[str, Any]()
+    sources: dict[str, Callable[[], Mapping[str, Any]]] = {
+        "--camera": lambda: {} if lens is None else camera_values(lens),
+        f"--params {args.params}": lambda: (args.params and load_params_file(args.params)) or {},
+        "-p": lambda: dict(map(parse_assignment, args.assignments)),
+    }
+    for where, source in sources.items():
+        try:
+            values |= source()
+            build(values)
+        except ValueError as error:
+            raise UsageError(f"{where}: {error}") from error
+    return values
+
+
+def given_settings(args: Any) -> NodeConfig:
+    """Return the settings of :func:`given_values`."""
+    return build(given_values(args))
+
+
+def remapped(options: Any, known: Sequence[str] = (*INPUTS, IMAGE)) -> dict[str, str]:
+    """Return the topics that ``-r`` gives, by input; images are one.
+
+    Raises:
+        UsageError: for an unknown input.
+    """
+    topics = dict[str, str]()
+    for text in options.remaps:
+        name, given, topic = text.partition(":=")
+        if not given or not topic or name not in known:
+            raise UsageError(f"-r: expected NAME:=TOPIC of {', '.join(known)}; got {text!r}")
+        topics[name] = topic if topic.startswith("/") else f"/{topic}"
+    return topics
+
+
+def given_topics(options: Any) -> dict[str, str | None]:
+    """Return the topics of the localizer's inputs."""
+    return {name: topic for name, topic in remapped(options).items() if name in INPUTS}
+
+
 def given_lens(options: LensOptions) -> Camera | None:
     """Return the camera of ``--camera``, if there is one."""
     return None if options.calibration is None else read_calibration(options.calibration)
@@ -87,19 +135,20 @@ def shutter_values(args: ImageOptions) -> dict[str, Any]:
     return values
 
 
-def print_left_out(refused: Mapping[str, str]) -> None:
-    """Print why images could not be used."""
-    for detail in refused.values():
-        print(f"images that cannot be used are left out, the first one because {detail}")
-
-
-def print_times(clock: ImageClock | None, readout_time: float = 0.0, period: float = 0.0) -> None:
-    """Say where the times of the images come from, and what speaks against them.
+def print_images(
+    refused: Mapping[str, str], clock: ImageClock | None, readout_time: float = 0.0,
+    period: float = 0.0,
+) -> None:  # fmt: skip
+    """Print why images could not be used, where the times of the others come from, and faults.
 
     Args:
+        refused: details, by their reasons.
+        clock: of images without times of their own.
         readout_time: s, as it was given.
         period: s from one image to the next.
     """
+    for detail in refused.values():
+        print(f"images that cannot be used are left out, the first one because {detail}")
     faults = [readout_fault(readout_time, period)]
     if clock is not None:
         print(clock.description())
@@ -169,8 +218,7 @@ def each_image(
         seen = usable(source.shots, direction, tally)
         for _, image, camera in tqdm(seen, unit="image", desc="detect", disable=None):
             yield image, camera
-    print_left_out(tally.refused)
-    print_times(source.clock)
+    print_images(tally.refused, source.clock)
 
 
 def recorded(
@@ -197,13 +245,11 @@ def cameras_of(args: T, recordings: Sequence[Path], config: NodeConfig) -> dict[
 
     Of each: the options of a recording of this camera alone, and the frame of its optical axes.
     """
-    found: list[tuple[str, dict[str, Any], str]]
-    if len(recordings) > 1:
-        found = [
-            (re.sub(r"\W", "_", path.stem, flags=re.ASCII), {"recording": path}, "")
-            for path in recordings
-        ]
-    else:
+    found = [
+        (re.sub(r"\W", "_", path.stem, flags=re.ASCII), dict[str, Any](recording=path), "")
+        for path in recordings
+    ]
+    if len(recordings) == 1:
         found = _in_one_bag(recordings[0], config.cameras if config.of_cameras else None)
     names = [name for name, _, _ in found]
     if len(set(names)) < max(len(names), 2) or not all(name[:1].isalpha() for name in names):
@@ -242,9 +288,7 @@ class TargetOptions:
 
     map: Path | None = option("marker map; also that of keypoints, where they are read", "FILE")
     board: str | None = option("instead: inner corners along a row x rows of a chessboard", "6x4")
-    square: float | None = option(
-        "side of its squares in metres", "M", above=0.0
-    )  # fmt: skip
+    square: float | None = option("side of its squares in metres", "M", above=0.0)
 
 
 def find_map(args: TargetOptions) -> MarkerMap:

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING
 
 from rs_localizer.cli import WORKING, earlier_result, refuse_existing
 from rs_localizer.cli.options import FleetOptions, ResultOptions, UsageError, argument, option
-from rs_localizer.cli.recording_input import ImageOptions
-from rs_localizer.cli.settings_args import given_topics, given_values
+from rs_localizer.cli.recording_input import ImageOptions, given_topics, given_values
 from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import is_bag, open_bag
 from rs_localizer.io.recording import BRIDGED, RESULT
@@ -95,17 +94,15 @@ def _settings(options: Options) -> NodeConfig:
     return build(given_values(options) | given)
 
 
-def _pictures(recording: Path) -> str:
-    """Describe a recording without matches, as ``is a video``; empty if it has matches."""
-    if not is_bag(recording):
-        return holds_images(recording)
-    with open_bag(recording) as bag:
-        return "holds images" if image_topics(bag) and not has_frames(bag) else ""
-
-
 def _replay_one(options: Options, recording: Path, out: Path, timed: bool = True) -> Tally:
     """Replay a recording into ``out``, and say what came of it (``timed``: how fast, too)."""
-    if not (pictures := _pictures(recording)):
+    pictures = ""  # of a recording without matches, as ``is a video``
+    if not is_bag(recording):
+        pictures = holds_images(recording)
+    else:
+        with open_bag(recording) as bag:
+            pictures = "holds images" if image_topics(bag) and not has_frames(bag) else ""
+    if not pictures:
         if options.rate is not None:
             raise UsageError("--rate is of images without times; poses at a rate are --pose-rate")
         return _replay_matches(options, recording, recording, out, timed)

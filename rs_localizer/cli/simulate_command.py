@@ -175,34 +175,18 @@ def _smooth_motion(args: Options) -> TrueMotion:
         return RecordedMotion(read_tum(data.path(data.HAND_MOTION) if bundled else args.trajectory))
     if angular is None and linear is None:
         angular, linear = _ANGULAR_VELOCITY, _LINEAR_VELOCITY
-    return ConstantVelocity(
-        np.array(angular or (0.0, 0.0, 0.0)),
-        np.array(linear or (0.0, 0.0, 0.0)),
-        args.start + (_DURATION if args.duration is None else args.duration),
-        start_ns=_START_NS,
-    )
-
-
-def _stamps(args: Options, camera: Camera, motion: TrueMotion) -> list[int]:
-    """Return the times at which the frames begin, ns; ValueError when there are none."""
-    start_ns = motion.intervals_ns[0][0] + round(args.start * 1e9)
-    end_ns = math.inf if args.duration is None else start_ns + round(args.duration * 1e9)
-    every = frame_stamps(motion, camera, _POINTS.rate)
-    stamps = [stamp for stamp in every if start_ns <= stamp < end_ns]
-    if not stamps:
-        raise ValueError("no frame lies within the motion, --start and --duration")
-    return stamps
+    rest, duration = (0.0, 0.0, 0.0), _DURATION if args.duration is None else args.duration
+    velocities = np.array(angular or rest), np.array(linear or rest)
+    return ConstantVelocity(*velocities, args.start + duration, start_ns=_START_NS)
 
 
 def _world(args: Options, motion: TrueMotion, rng: np.random.Generator) -> Scene | Array:
     """Return surroundings of a motion: a scene to be rendered, or the points (n,3) of a room."""
     if args.images:
         return SCENES[args.walls](sampled_states(motion))
-    ways = [
-        motion.state(first, np.linspace(0.0, (last - first) * 1e-9, 200)).positions
-        for first, last in motion.intervals_ns
-    ]
-    return room(np.concatenate(ways), rng)
+    times = ((first, np.linspace(0.0, (end - first) * 1e-9, 200)) for first, end in
+             motion.intervals_ns)  # fmt: skip
+    return room(np.concatenate([motion.state(*each).positions for each in times]), rng)
 
 
 def _see(
@@ -211,11 +195,11 @@ def _see(
 ) -> Iterator[SimulatedFrame | RenderedFrame]:  # fmt: skip
     """Return the frames that a camera sees; ``place`` is its own among the random numbers."""
     seed = args.seed + place
+    usual = _PICTURES if isinstance(world, Scene) else _POINTS
+    noise = usual.noise if args.noise is None else args.noise
     if isinstance(world, Scene):
-        noise = _PICTURES.noise if args.noise is None else args.noise
         renderer = Renderer(camera, world.planes, ImageSettings(args.exposure, noise))
         return rendered_frames(renderer, motion, stamps, seed)
-    noise = _POINTS.noise if args.noise is None else args.noise
     seen = FrameSettings(args.points, noise, args.outliers)
     return simulate_frames(camera, motion, world, seen, stamps_ns=stamps, seed=seed)
 
@@ -231,7 +215,7 @@ def run(args: Options) -> dict[str, object]:
     recorder = _Recorder(args)
     with atomic_directory(args.out, earlier_result(args, "metadata.yaml")) as built:
         recorder.write(built)
-    return _print_result(args, recorder.world, recorder.stamps, recorder.counts)
+    return recorder.print_result()
 
 
 class _Recorder:
@@ -244,7 +228,12 @@ class _Recorder:
         self._parts = None if args.rig is None else read_camchain(args.rig)
         cameras = [_camera(args)] if self._parts is None else [*self._parts.cameras.values()]
         self._camera = cameras[0]
-        self.stamps = _stamps(args, self._camera, self._motion)
+        start_ns = self._motion.intervals_ns[0][0] + round(args.start * 1e9)
+        end_ns = math.inf if args.duration is None else start_ns + round(args.duration * 1e9)
+        every = frame_stamps(self._motion, self._camera, _POINTS.rate)
+        self.stamps = [stamp for stamp in every if start_ns <= stamp < end_ns]
+        if not self.stamps:
+            raise ValueError("no frame lies within the motion, --start and --duration")
         self._rng = np.random.default_rng(args.seed)
         self.world = _world(args, self._motion, self._rng)
         self.counts = list[int]()  # points of the frames
@@ -310,28 +299,26 @@ class _Recorder:
                 write_rig_frame(bag, parts, motion, image, self._keypoints(image.frame))
         return rig_parameters(parts)
 
-
-def _print_result(
-    args: Options, world: Scene | Array, stamps: list[int], counts: list[int]
-) -> dict[str, object]:
-    """Say what was written, and what comes next."""
-    out, lasted = str(args.out), (stamps[-1] - stamps[0]) * 1e-9
-    figures: dict[str, object] = {"recording": str(args.out), "images": len(stamps)}
-    said = f"{args.out}: {len(stamps)} {'images' if args.images else 'frames'} in {lasted:.1f} s"
-    following = list[str]()
-    if counts:
-        figures["points_per_image"] = mean = float(np.mean(counts))
-        said += f", {mean:.0f} points each"
-        if few := sum(count < args.points for count in counts):
-            said += f" (of {args.points} asked for; {few} frames see fewer, "
-            said += f"{counts.count(0)} of them none)"
-        following = ["replay", out, "--params", f"{out}/{PARAMETERS}", "--out", f"{out}_poses"]
-        following += ["--map", f"{out}/{MAP}"] if args.keypoints else []
-    elif isinstance(world, Scene) and world.marker_map is not None:
-        figures["markers"] = count = len(world.marker_map.markers)
-        said += f", {count} markers on the walls"
-        following = ["detect", out, "--map", f"{out}/{MARKER_MAP}", "--out", f"{out}_markers"]
-    print(said)
-    if following:
-        print(f"next: {typed('rs_localizer', *following)}")
-    return figures
+    def print_result(self) -> dict[str, object]:
+        """Say what was written, and what comes next."""
+        args, counts, world, out = self._args, self.counts, self.world, str(self._args.out)
+        lasted, count = (self.stamps[-1] - self.stamps[0]) * 1e-9, len(self.stamps)
+        figures: dict[str, object] = {"recording": out, "images": count}
+        said = f"{out}: {count} {'images' if args.images else 'frames'} in {lasted:.1f} s"
+        following = list[str]()
+        if counts:
+            figures["points_per_image"] = mean = float(np.mean(counts))
+            said += f", {mean:.0f} points each"
+            if few := sum(count < args.points for count in counts):
+                said += f" (of {args.points} asked for; {few} frames see fewer, "
+                said += f"{counts.count(0)} of them none)"
+            following = ["replay", out, "--params", f"{out}/{PARAMETERS}", "--out", f"{out}_poses"]
+            following += ["--map", f"{out}/{MAP}"] if args.keypoints else []
+        elif isinstance(world, Scene) and world.marker_map is not None:
+            figures["markers"] = count = len(world.marker_map.markers)
+            said += f", {count} markers on the walls"
+            following = ["detect", out, "--map", f"{out}/{MARKER_MAP}", "--out", f"{out}_markers"]
+        print(said)
+        if following:
+            print(f"next: {typed('rs_localizer', *following)}")
+        return figures

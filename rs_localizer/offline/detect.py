@@ -82,14 +82,10 @@ class DetectionOptions:
 
 
 def record_markers(
-    shots: Iterable[Shot | Carried],
-    detector: FrameDetector,
-    bag: BagWriter,
-    options: DetectionOptions,
-    *,
-    done: Callable[[], object] = lambda: None,
+    shots: Iterable[Shot | Carried], detector: FrameDetector, bag: BagWriter,
+    options: DetectionOptions, *, done: Callable[[], object] = lambda: None,
     tell: Callable[[str], object] = lambda text: None,
-) -> Extraction:
+) -> Extraction:  # fmt: skip
     """Write the corners of all images that show any, each with its CameraInfo.
 
     Args:
@@ -328,12 +324,9 @@ def static_residual(camera: Camera, detected: Detected) -> float:
 
 
 def record_features(
-    shots: Iterable[Shot | Carried],
-    extractor: FrameExtractor,
-    bag: BagWriter,
-    options: DetectionOptions,
-    done: Callable[[], object] = lambda: None,
-) -> Extraction:
+    shots: Iterable[Shot | Carried], extractor: FrameExtractor, bag: BagWriter,
+    options: DetectionOptions, done: Callable[[], object] = lambda: None,
+) -> Extraction:  # fmt: skip
     """Write the keypoints of all images that have any, each with its CameraInfo.
 
     Raises:

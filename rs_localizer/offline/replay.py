@@ -303,8 +303,11 @@ def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> Trans
     for topic in tf:
         for _, _, message in bag.messages((topic,)):
             tree.add(message, static=topic == TF_STATIC)
-        if topic == TF_STATIC and all(_connected(tree, frame, camera) for frame in ends):
-            break  # /tf is long
+        if topic == TF_STATIC:
+            with contextlib.suppress(TransformError):
+                for frame in ends:
+                    tree.moves(frame, camera)
+                break  # /tf is long
     for name, frame in wanted.items():
         try:
             tree.moves(frame, camera)
@@ -322,20 +325,10 @@ def _frame_of(bag: BagReader, topic: str) -> str | None:
     return next((message.header.frame_id for _, _, message in bag.messages((topic,))), None)
 
 
-def _connected(tree: TransformTree, target: str, source: str) -> bool:
-    try:
-        tree.moves(target, source)
-    except TransformError:
-        return False
-    return True
-
-
 def prepare_replay(
-    bag: BagReader,
-    config: NodeConfig,
-    given: Mapping[str, str | None] | None = None,
+    bag: BagReader, config: NodeConfig, given: Mapping[str, str | None] | None = None,
     notice: Notify = unheard,
-) -> tuple[Topics, FrameLocalizer]:
+) -> tuple[Topics, FrameLocalizer]:  # fmt: skip
     """Prepare the inputs of :func:`replay`: topics, and a localizer with its map.
 
     Args:

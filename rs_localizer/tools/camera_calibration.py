@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The readout time of a recording: value, honest deviation, direction, and oddities."""
+"""A camera by a recording: readout time with an honest deviation, direction, lens, oddities."""
 
 from __future__ import annotations
 
@@ -9,16 +9,15 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import REVERSED, ScanDirection
 from rs_localizer.io.imu import ImuRecording
 from rs_localizer.localizer import Localizer
-from rs_localizer.tools.adjust.bodies import is_flat
 from rs_localizer.tools.adjust.fit import Fit, cheaper, fit, image_speeds
 from rs_localizer.tools.adjust.intrinsics import LensErrors, lens_difference, lens_errors
 from rs_localizer.tools.adjust.observe import ImagePoints, Posed, collect, in_order, localize_each
@@ -30,12 +29,12 @@ from rs_localizer.tools.adjust.variables import (
     Freedom,
     SplineKeypoints,
     Unknowns,
+    is_flat,
     start_state,
 )
-from rs_localizer.tools.imu_mount import MountFound, NoMount, gyro_samples, mount_of, with_gyro
+from rs_localizer.tools.imu_mount import MountFound, gyro_samples, mount_of, with_gyro
 from rs_localizer.tools.readout_belief import (
     Block,
-    Evidence,
     Stamps,
     apart_of,
     disagreement,
@@ -50,12 +49,11 @@ _BLOCK_SECONDS, _LEAST_BLOCKS, _MOST_BLOCKS = 3.0, 3, 8
 
 
 def blocks_of(
-    camera: Camera, observations: SplineKeypoints, whole: Fit, count: int | None = None
+    observations: SplineKeypoints, whole: Fit, count: int | None = None
 ) -> tuple[Block, ...]:
     """Return equal parts of the recording, each with its own lens and shape of the map.
 
     Args:
-        camera: whose lens the whole was started from.
         count: of the parts; None: as many as the recording is long enough for.
     """
     first, last = observations.times.min(), observations.times.max()
@@ -69,22 +67,18 @@ def blocks_of(
         if state is None or not np.any(part.trusted):
             continue
         try:
-            own = fit(camera, part, state, whole.freedom)
+            own = fit(part, state, whole.freedom)
         except ValueError:  # undetermined, or a lens that no camera has
             continue
-        value, deviation = own.state.readout_time, own.readout_time_deviation
-        delay = _delay(own)
-        shape = own.state.landmarks
-        blocks.append(Block(float(start), float(end), value, deviation, own.camera, shape, *delay))
+        found = own.state
+        delay = (math.nan, math.nan) if found.mount is None else (
+            found.mount.delay, math.sqrt(float(own.border_covariance[DELAY - MOUNT, DELAY - MOUNT]))
+        )  # fmt: skip
+        blocks.append(Block(
+            float(start), float(end), found.readout_time, own.readout_time_deviation, own.camera,
+            found.landmarks, *delay,
+        ))  # fmt: skip
     return tuple(blocks)
-
-
-def _delay(own: Fit) -> tuple[float, float]:
-    """Delay of the gyroscope and its deviation, s; NaN without one."""
-    if own.state.mount is None:
-        return math.nan, math.nan
-    at = DELAY - MOUNT
-    return own.state.mount.delay, math.sqrt(float(own.border_covariance[at, at]))
 
 
 def cut(state: Unknowns, start: float, end: float) -> Unknowns | None:
@@ -119,16 +113,133 @@ _LEAST_STAMPS = 1e-5  # s
 _ACCELERATIONS, _LEAST_ACCELERATION = 1.5, 0.3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraCalibration(Evidence):
-    """Findings of a recording on its camera."""
+# Parts that differ by this share of the value beyond chance, and by more than a value may be off:
+# the camera may turn its picture.
+_STABILISED = 0.1
+_HALVES_SIGMAS = 3.0
+# A readout time is determined to this part of the interval between images, 1.7 ms at 30 Hz: by the
+# estimate itself a slow motion, which makes it too long, would make it better known. Nor do slow
+# cameras have slow sensors.
+_DETERMINED_SHARE, _LONGEST_INTERVAL = 0.05, 1.0 / 30.0
+# Fewest parts that have to determine it by themselves, or length (s) that the recording has to
+# have.
+_LEAST_TELLING, _LONG = 3, 9.0
+# A global shutter has 0 within this many deviations, and these within this (s): the fastest rolling
+# shutters take 4 ms.
+_GLOBAL_SIGMAS, _GLOBAL = 3.0, 2e-3
+# Images that were exposed so far (s rms) beside their stamps have stamps that no camera gave.
+_BESIDE = 1e-3
+# Readouts cannot take longer than this part of the interval between images.
+_LONGEST = 1.05
 
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraCalibration:
+    """Findings of a recording on its camera, and whether its readout time is believed."""
+
+    readout_time: float  # s; negative: against the scan direction that was given
+    deviation: float  # s, with what blocks and halves disagree in, and doubts of the stamps
+    blocks: tuple[Block, ...]
+    halves: tuple[Block, ...]
+    inflation: float  # of the deviation, because the blocks disagree; 1: they do not
+    stamps: Stamps
+    own_stamps: bool  # the images' own, not those of a rate
+    jitter: float  # s rms, by how much images were exposed beside their stamps; 0: they were not
+    seconds: float  # how long the images with a pose last
+    turned: bool  # whether rows rotate otherwise than images
     fit: Fit
     posed: Posed
     images: int  # that show the map
     lens: LensErrors  # standard deviations of the lens that was found
     mount: MountFound | None = None  # of the IMU, where there is one
     no_mount: str = ""  # why there is none
+
+    @property
+    def limit(self) -> float:
+        """Deviation (s) from which on a readout time is not determined."""
+        return _DETERMINED_SHARE * min(self.stamps.interval, _LONGEST_INTERVAL)
+
+    @property
+    def telling(self) -> int:
+        """How many blocks determine it by themselves."""
+        return sum(block.deviation < self.limit for block in self.blocks)
+
+    @property
+    def determined(self) -> bool:
+        """True where the motion determines the readout time, and parts can speak against it."""
+        long_enough = self.telling >= _LEAST_TELLING or self.seconds >= _LONG
+        return self.deviation < self.limit and long_enough
+
+    @property
+    def near_zero(self) -> bool:
+        """True where 0 lies within the error."""
+        return abs(self.readout_time) < _GLOBAL_SIGMAS * self.deviation
+
+    @property
+    def global_shutter(self) -> bool:
+        """True where nothing else than a global shutter is left."""
+        sure = _GLOBAL_SIGMAS * self.deviation < _GLOBAL and self.inflation == 1.0
+        return self.determined and self.near_zero and sure and self.own_stamps
+
+    @property
+    def sense(self) -> float:
+        """The sign by which readout times of parts are those along the direction that is told."""
+        return 1.0 if self.global_shutter else math.copysign(1.0, self.readout_time)
+
+    @property
+    def stabilised(self) -> bool:
+        """True where the parts disagree as those of a camera that turns its picture do."""
+        least = max(_STABILISED * abs(self.readout_time), self.limit)
+        apart, noise = apart_of(self.halves)
+        by_halves = apart > max(_HALVES_SIGMAS * noise, 2.0 * least)
+        values = [block.readout_time for block in self.blocks]
+        scatter = np.std(values, ddof=1) if len(values) > 1 else 0.0
+        return bool((self.inflation > 1.0 and scatter > least) or by_halves)
+
+    @property
+    def processed(self) -> str:
+        """Why the film is hardly what the camera saw, one sentence; '': nothing says so."""
+        why = []
+        if self.stabilised:
+            parts = ", ".join(f"{1e3 * self.sense * one.readout_time:.2f}" for one in self.blocks)
+            why.append(f"parts of the recording disagree ({parts} ms)")
+        if self.jitter > _BESIDE:
+            why.append(f"exposures are {1e3 * self.jitter:.1f} ms rms off their stamps")
+        if self.turned:
+            why.append("rows rotate otherwise than images")
+        return (
+            f"{' and '.join(why)}: is image stabilization on, or was the video processed? Record "
+            "with the camera's own time stamps, without losing images or re-encoding the video"
+            if why
+            else ""
+        )
+
+    @property
+    def disbelief(self) -> str:
+        """One line with the figure when the readout time is not determined; or ''."""
+        interval = 1e3 * self.stamps.interval
+        slowest = abs(self.readout_time) + _GLOBAL_SIGMAS * self.deviation
+        if self.processed:
+            why = f"; {self.processed}"
+        elif abs(self.readout_time) > _LONGEST * self.stamps.interval:
+            why = f" is longer than {interval:.1f} ms between images: is the frame rate right?"
+        elif not self.determined:
+            why = (
+                f" (limit {1e3 * self.limit:.1f} ms; {self.telling} of {len(self.blocks)} parts of "
+                f"the {self.seconds:.1f} s determine it on their own, three must, or 9 s): move "
+                "the camera faster, rotate it about all axes, and for longer"
+            )
+        elif not (self.near_zero or self.own_stamps) and slowest < _GLOBAL:
+            why = "; no rolling shutter is that fast: was the video stabilized or processed?"
+        elif self.near_zero and not self.global_shutter:
+            why = (
+                "; that is no proof of a global shutter: three deviations are more than 2 ms, its "
+                "parts differ, or the stamps are those of a video that was processed"
+            )
+        else:
+            return ""
+        value = 1e3 * self.sense * self.readout_time
+        return f"not observable: {value:.1f} +- {1e3 * self.deviation:.1f} ms{why}"
 
     @property
     def held(self) -> int:
@@ -152,14 +263,10 @@ class CameraCalibration(Evidence):
 
 
 def calibrate(
-    camera: Camera,
-    images: list[ImagePoints],
-    *,
-    intrinsics: bool = False,
-    imu: ImuRecording | None = None,
-    own_stamps: bool = True,
+    camera: Camera, images: list[ImagePoints], *, intrinsics: bool = False,
+    imu: ImuRecording | None = None, own_stamps: bool = True,
     done: Callable[[], object] = lambda: None,
-) -> CameraCalibration:
+) -> CameraCalibration:  # fmt: skip
     """Estimate readout time and lens of a camera from a recording in which it moves.
 
     Args:
@@ -190,38 +297,34 @@ def calibrate(
         )
     posed = collect(camera, images, results)
     freedom = _freedom(posed.observations, intrinsics)
-    fitted = _smooth(camera, posed, stamps.interval, freedom)
+    fitted = _smooth(posed, stamps.interval, freedom)
     # Times of images and finer knots would follow what a stabilizer does, for minutes.
-    turned = _is_turned(fitted, stamps, images)
+    turned = is_turned(fitted, stamps.interval, images)
     if not turned:
-        fitted = _best(camera, posed, stamps.interval, fitted, freedom)
+        fitted = _best(posed, stamps.interval, fitted, freedom)
     observations, no_mount = within(posed.observations, fitted.state.spline), ""
     if imu is not None:
         try:
             samples = gyro_samples(imu, posed.start_ns)
-            observations, fitted = with_gyro(
-                camera, observations, fitted, samples, imu.camera_from_imu
-            )
-        except (NoMount, Undetermined) as error:
+            observations, fitted = with_gyro(observations, fitted, samples, imu.camera_from_imu)
+        except Undetermined as error:
             no_mount = str(error)
-    judged = _judged(camera, posed, observations, stamps, fitted, len(images))
-    own_stamps = own_stamps or stamps.irregular
-    return replace(judged, no_mount=no_mount, own_stamps=own_stamps, turned=turned)
+    return _judged(
+        observations, fitted, stamps, posed=posed, images=len(images), no_mount=no_mount,
+        own_stamps=own_stamps or stamps.irregular, turned=turned,
+    )  # fmt: skip
 
 
-def _is_turned(fitted: Fit, stamps: Stamps, images: list[ImagePoints]) -> bool:
-    """Return :func:`is_turned` by the shutter that was found, if it is one."""
-    readout_time = fitted.state.readout_time
-    if not 3.0 * fitted.readout_time_deviation < abs(readout_time) < stamps.interval:
+def is_turned(fitted: Fit, interval: float, images: list[ImagePoints]) -> bool:
+    """Return whether rows of images rotate otherwise than the images, as of a stabilized film.
+
+    By the shutter that was found, if it is one: shorter than the ``interval`` (s).
+    """
+    readout_time, camera = fitted.state.readout_time, fitted.camera
+    if not 3.0 * fitted.readout_time_deviation < abs(readout_time) < interval:
         return False
-    direction = ScanDirection(fitted.camera.scan_direction)
     if readout_time < 0.0:
-        direction = REVERSED[direction]
-    return is_turned(replace(fitted.camera, scan_direction=direction), images)
-
-
-def is_turned(camera: Camera, images: list[ImagePoints]) -> bool:
-    """Return whether rows of images rotate otherwise than the images, as of a stabilized film."""
+        camera = replace(camera, scan_direction=REVERSED[ScanDirection(camera.scan_direction)])
     tracker = Tracker(Localizer(camera))
     middle_ns = round(-1e9 * camera.readout_time * camera.first_row_time)
     for image in images:
@@ -249,63 +352,59 @@ def _freedom(observations: SplineKeypoints, intrinsics: bool) -> Freedom:
     often = len(landmarks) <= min(_MOST_BOARD_POINTS, sights / _LEAST_SIGHTS)
     size = float(np.linalg.norm(np.ptp(landmarks, axis=0)))
     return Freedom(
-        lens=True,
-        lens_deviations=None if intrinsics else _GIVEN_LENS,
-        landmarks=_BOARD_SHARE * size if often else 0.0,
-        paper=often and is_flat(landmarks),
-    )
+        lens=True, lens_deviations=None if intrinsics else _GIVEN_LENS,
+        landmarks=_BOARD_SHARE * size if often else 0.0, paper=often and is_flat(landmarks),
+    )  # fmt: skip
 
 
-def _smooth(camera: Camera, posed: Posed, interval: float, freedom: Freedom) -> Fit:
+def _smooth(posed: Posed, interval: float, freedom: Freedom) -> Fit:
     """Fit the readout time, then all that is free."""
-    spacing = min(LONGEST_SPACING, interval)
-    spline = first_spline(posed.times, posed.rotations, posed.positions, spacing, 0.5 * interval)
+    spline = first_spline(
+        posed.times, posed.rotations, posed.positions, min(LONGEST_SPACING, interval),
+        0.5 * interval,
+    )  # fmt: skip
     observations = within(posed.observations, spline)
-    plain = fit(camera, observations, start_state(camera, observations, spline), Freedom())
-    return fit(camera, observations, plain.state, _calm(plain.state, freedom), plain.deviation)
+    plain = fit(observations, start_state(observations, spline, 0.0), Freedom())
+    return fit(observations, plain.state, _calm(plain.state, freedom), plain.deviation)
 
 
-def _best(camera: Camera, posed: Posed, interval: float, fitted: Fit, freedom: Freedom) -> Fit:
+def _best(posed: Posed, interval: float, fitted: Fit, freedom: Freedom) -> Fit:
     """Fit the images' times and finer knots, where they are worth it."""
     observations = within(posed.observations, fitted.state.spline)
     with suppress(Undetermined):  # a richer model that cannot be determined is no candidate
-        other = _unsteady(camera, observations, fitted, interval, freedom)
+        other = _unsteady(observations, fitted, interval, freedom)
         unsteady = other.freedom.stamps > _LEAST_JITTER * interval
         if unsteady and cheaper(other, fitted, len(other.state.delays)):
             fitted = other
     with suppress(Undetermined):
-        state = replace(
-            fitted.state, spline=refined(fitted.state.spline, 0.5 * min(LONGEST_SPACING, interval))
-        )
-        finer = fit(camera, observations, state, fitted.freedom, fitted.deviation)
+        halved = refined(fitted.state.spline, 0.5 * min(LONGEST_SPACING, interval))
+        state = replace(fitted.state, spline=halved)
+        finer = fit(observations, state, fitted.freedom, fitted.deviation)
         added = 6 * (len(finer.state.spline.positions) - len(fitted.state.spline.positions))
         if cheaper(finer, fitted, added):
             fitted = finer
     return fitted
 
 
-def _unsteady(
-    camera: Camera, observations: SplineKeypoints, fitted: Fit, interval: float, freedom: Freedom
-) -> Fit:
+def _unsteady(observations: SplineKeypoints, fitted: Fit, interval: float, freedom: Freedom) -> Fit:
     """Fit a time of its own for each image, from tight to loose to its actual spread."""
     own, other = _calm(fitted.state, freedom), fitted
     for share in _FIRST_JITTERS:
         own = replace(own, stamps=share * interval)
-        other = fit(camera, observations, other.state, own)
-    own = replace(own, stamps=max(_jitter(camera, observations, other.state), _LEAST_STAMPS))
-    return fit(camera, observations, other.state, own, other.deviation)
+        other = fit(observations, other.state, own)
+    own = replace(own, stamps=max(_jitter(observations, other.state), _LEAST_STAMPS))
+    return fit(observations, other.state, own, other.deviation)
 
 
-def _jitter(camera: Camera, observations: SplineKeypoints, state: Unknowns) -> float:
+def _jitter(observations: SplineKeypoints, state: Unknowns) -> float:
     """Return the rms distance (s) of the images' own times from their stamps.
 
     By how one image differs from the mean of its neighbours: times that drift are nearly a motion
     that drifts. And by the fast images: in slow ones a hundredth of a pixel, which may be the
     detector's error, is worth a millisecond.
     """
-    weights = np.bincount(
-        observations.frames, image_speeds(camera, observations, state) ** 2, len(state.delays)
-    )
+    speeds = image_speeds(observations, state)
+    weights = np.bincount(observations.frames, speeds**2, len(state.delays))
     weights = np.minimum(weights[1:-1], np.minimum(weights[:-2], weights[2:]))
     beside = np.diff(state.delays, 2)
     return float(np.sqrt(weights @ beside**2 / (6.0 * np.sum(weights))))
@@ -313,17 +412,12 @@ def _jitter(camera: Camera, observations: SplineKeypoints, state: Unknowns) -> f
 
 def _calm(state: Unknowns, freedom: Freedom) -> Freedom:
     """Add a prior of the accelerations that the motion itself shows."""
-    layout = state.spline.layout
-    states = state.spline.states(layout.control_times())
+    states = state.spline.states(state.spline.layout.control_times())
     angular, linear = (
-        float(np.sqrt(np.median(np.sum(of**2, axis=1))))
+        max(_ACCELERATIONS * float(np.sqrt(np.median(np.sum(of**2, axis=1)))), _LEAST_ACCELERATION)
         for of in (states.angular_acceleration, states.linear_acceleration)
     )
-    return replace(
-        freedom,
-        angular_acceleration=max(_ACCELERATIONS * angular, _LEAST_ACCELERATION),
-        linear_acceleration=max(_ACCELERATIONS * linear, _LEAST_ACCELERATION),
-    )
+    return replace(freedom, angular_acceleration=angular, linear_acceleration=linear)
 
 
 def within(observations: SplineKeypoints, spline: Spline) -> SplineKeypoints:
@@ -332,60 +426,36 @@ def within(observations: SplineKeypoints, spline: Spline) -> SplineKeypoints:
 
 
 def _judged(
-    camera: Camera,
-    posed: Posed,
-    observations: SplineKeypoints,
-    stamps: Stamps,
-    fitted: Fit,
-    images: int,
+    observations: SplineKeypoints, fitted: Fit, stamps: Stamps, *, posed: Posed, **known: Any
 ) -> CameraCalibration:
-    blocks, halves = (
-        blocks_of(camera, observations, fitted),
-        blocks_of(camera, observations, fitted, 2),
-    )
-    share = _interval_share(fitted, stamps)
-    values = _values_of(blocks, "readout_time")
+    """Return the findings, by parts of the recording, beside what is ``known`` of it."""
+    blocks, halves = blocks_of(observations, fitted), blocks_of(observations, fitted, 2)
+    # The relative deviation of the interval, if stamps are even and images were not. A variance
+    # from this many images is no better known than this.
+    chance = 1.0 + 2.0 * math.sqrt(2.0 / len(fitted.state.delays))
+    unsaid = fitted.freedom.stamps**2 - chance * stamps.jitter**2
+    share = _INTERVAL_SHARE * math.sqrt(max(unsaid, 0.0)) / stamps.interval
+    values, deviations, delays, spreads = np.reshape(
+        [(it.readout_time, it.deviation, it.delay, it.delay_deviation) for it in blocks], (-1, 4)
+    ).T
     # Of images that are missing where stamps are even, each part has a share of its own.
-    deviations = np.hypot(_values_of(blocks, "deviation"), share * values)
+    deviations = np.hypot(deviations, share * values)
     inflation, mount = disagreement(values, deviations), None
     if observations.gyro is not None:
-        doubt = disagreement(_values_of(blocks, "delay"), _values_of(blocks, "delay_deviation"))
-        mount = mount_of(camera, fitted, observations.gyro, doubt)
+        mount = mount_of(observations, fitted, disagreement(delays, spreads))
     at = slice(1, 1 + len(fitted.state.lens))
     lens = lens_errors(fitted.camera, inflation**2 * fitted.border_covariance[at, at])
     if len(halves) == 2:
-        lens = lens.or_half(lens_difference(halves[0].camera, halves[1].camera))
-    return CameraCalibration(
-        readout_time=fitted.state.readout_time,
-        deviation=math.hypot(
-            fitted.readout_time_deviation * inflation,
-            share * fitted.state.readout_time,
-            0.5 * apart_of(halves)[0],
-            discrepancy(fitted.state.readout_time, values, inflation * deviations),
-        ),
-        blocks=blocks,
-        halves=halves,
-        own_stamps=True,
-        jitter=fitted.freedom.stamps,
-        seconds=float(np.ptp(posed.times)),
-        lens=lens,
-        inflation=inflation,
-        stamps=stamps,
-        fit=fitted,
-        posed=posed,
-        images=images,
-        mount=mount,
-        turned=False,
+        apart = np.array(lens_difference(halves[0].camera, halves[1].camera))
+        lens = LensErrors(*np.hypot(lens, 0.5 * apart).tolist())
+    deviation = math.hypot(
+        fitted.readout_time_deviation * inflation,
+        share * fitted.state.readout_time,
+        0.5 * apart_of(halves)[0],
+        discrepancy(fitted.state.readout_time, values, inflation * deviations),
     )
-
-
-def _values_of(blocks: tuple[Block, ...], name: str) -> Array:
-    return np.array([getattr(block, name) for block in blocks])
-
-
-def _interval_share(fitted: Fit, stamps: Stamps) -> float:
-    """Return the relative deviation of the interval, if stamps are even and images were not."""
-    # A variance from this many images is no better known than this.
-    chance = 1.0 + 2.0 * math.sqrt(2.0 / len(fitted.state.delays))
-    unsaid = fitted.freedom.stamps**2 - chance * stamps.jitter**2
-    return _INTERVAL_SHARE * math.sqrt(max(unsaid, 0.0)) / stamps.interval
+    return CameraCalibration(
+        readout_time=fitted.state.readout_time, deviation=deviation, blocks=blocks, halves=halves,
+        inflation=inflation, stamps=stamps, jitter=fitted.freedom.stamps, fit=fitted, posed=posed,
+        seconds=float(np.ptp(posed.times)), lens=lens, mount=mount, **known,
+    )  # fmt: skip

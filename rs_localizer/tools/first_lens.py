@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
 
 import cv2
 import numpy as np
@@ -37,6 +36,10 @@ _KINDS = (
     (DistortionModel.EQUIDISTANT, 0),
 )
 _RICHER = 0.9
+_FISHEYE_FLAGS = sum(  # which OpenCV 5 has moved
+    int(getattr(cv2.fisheye, name, getattr(cv2, name, 0)))
+    for name in ("CALIB_USE_INTRINSIC_GUESS", "CALIB_RECOMPUTE_EXTRINSIC", "CALIB_FIX_SKEW")
+)
 # Least angle (rad) from the axis to a corner of a fisheye: numbers of a narrower one compensate
 # each other, and the other kinds describe it as well.
 _FISHEYE = 1.0
@@ -89,7 +92,7 @@ def _calibrated(
         try:
             if model == DistortionModel.EQUIDISTANT:
                 _, K, D, turns, places = cv2.fisheye.calibrate(
-                    points, pixels, size, K, np.zeros((4, 1)), flags=_fisheye_flags()
+                    points, pixels, size, K, np.zeros((4, 1)), flags=_FISHEYE_FLAGS
                 )
             else:
                 flags |= cv2.CALIB_USE_INTRINSIC_GUESS
@@ -99,25 +102,14 @@ def _calibrated(
             lens = Camera(*size, K=K, D=D.ravel(), distortion_model=model)
         except (cv2.error, ValueError):  # numbers that no camera has
             continue
-        poses = zip(images, turns, places, strict=True)
-        errors = np.array([_error(lens, image, turn, place) for image, turn, place in poses])
-        total = np.sum(errors**2)
+        squares = []
+        for image, turn, place in zip(images, turns, places, strict=True):
+            local = image.points @ cv2.Rodrigues(turn)[0].T + place.ravel()
+            squares.append(np.mean(np.sum((lens.project(local) - image.pixels) ** 2, axis=1)))
+        errors, total = np.sqrt(squares), np.sum(squares)
         if np.isfinite(total) and (best is None or total < np.sum(best[1] ** 2)):
             best = lens, errors
     return best
-
-
-def _fisheye_flags() -> int:
-    """Return flags that OpenCV 5 has moved."""
-    names = ("CALIB_USE_INTRINSIC_GUESS", "CALIB_RECOMPUTE_EXTRINSIC", "CALIB_FIX_SKEW")
-    every: list[Any] = [getattr(cv2.fisheye, name, getattr(cv2, name, 0)) for name in names]
-    return int(sum(every))
-
-
-def _error(lens: Camera, image: ImagePoints, turn: Any, place: Any) -> float:
-    local = image.points @ cv2.Rodrigues(turn)[0].T + place.ravel()
-    off = lens.project(local) - image.pixels
-    return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
 
 
 def _likely(lens: Camera) -> bool:

@@ -49,10 +49,6 @@ _MOST_SCALE = 1.5
 _GIVEN_WEIGHT = 1e-3
 
 
-class NoMount(ValueError):
-    """Gyroscope and camera do not go together; the message says why."""
-
-
 def first_mount(samples: GyroSamples, spline: Spline, given: Array | None = None) -> GyroMount:
     """Return delay, rotation and bias under which the gyroscope best follows the camera.
 
@@ -60,61 +56,57 @@ def first_mount(samples: GyroSamples, spline: Spline, given: Array | None = None
         given: (3,3) camera_from_imu, as far as the motion does not tell it.
 
     Raises:
-        NoMount: when there are too few samples during the motion, or they show other turns.
+        Undetermined: when there are too few samples during the motion, or they show other turns.
     """
     layout = spline.layout
     # The same samples at every delay, else the shares they agree by could not be compared.
     near = samples.subset(samples.covered(layout, 0.0, _MOST_DELAY))
     if len(near.times) < _LEAST_GUESS:
-        raise NoMount(
+        raise Undetermined(
             f"{len(near.times)} samples of the IMU lie in the time of the images, at least "
             f"{_LEAST_GUESS} are needed"
         )
     near = near.subset(np.arange(len(near.times)) % (1 + len(near.times) // _GUESS_SAMPLES) == 0)
     delays = np.arange(-_MOST_DELAY, _MOST_DELAY + 0.5 * _DELAY_STEP, _DELAY_STEP)
     matches = [_match(near, spline, float(delay), given) for delay in delays]
-    best = max(matches, key=lambda match: match.explained)
-    if not best.explained > _LEAST_EXPLAINED:
-        raise NoMount(
+    mount, explained, scale = max(matches, key=lambda match: match[1])
+    if not explained > _LEAST_EXPLAINED:
+        raise Undetermined(
             f"the IMU's angular rates are not the camera's: within {1e3 * _MOST_DELAY:.0f} ms of "
-            f"each other's stamps {max(best.explained, 0.0):.0%} of them agree"
+            f"each other's stamps {max(explained, 0.0):.0%} of them agree"
         )
-    if not 1.0 / _MOST_SCALE < best.scale < _MOST_SCALE:
-        raise NoMount(
-            f"the IMU's angular rates are {best.scale:.3g} times the camera's: are they in rad/s?"
+    if not 1.0 / _MOST_SCALE < scale < _MOST_SCALE:
+        raise Undetermined(
+            f"the IMU's angular rates are {scale:.3g} times the camera's: are they in rad/s?"
         )
-    return best.mount
+    return mount
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Match:
-    mount: GyroMount
-    explained: float  # share of the gyroscope's variance
-    scale: float  # of the gyroscope's rates by the camera's
+def _match(
+    samples: GyroSamples, spline: Spline, delay: float, given: Array | None
+) -> tuple[GyroMount, float, float]:
+    """Return the best rotation (Kabsch) and bias at a delay.
 
-
-def _match(samples: GyroSamples, spline: Spline, delay: float, given: Array | None) -> _Match:
-    """Return the best rotation (Kabsch) and bias at a delay."""
+    And the share of the gyroscope's variance that they explain, and the scale of its rates.
+    """
     inside = samples.covered(spline.layout, delay, 0.0)
     if np.count_nonzero(inside) < _LEAST_GUESS:
-        return _Match(GyroMount(np.eye(3), np.zeros(3), delay), -np.inf, 1.0)
+        return GyroMount(np.eye(3), np.zeros(3), delay), -np.inf, 1.0
     rates = samples.rates[inside]
     turns = spline.states(samples.times[inside] + delay).angular
     rate, turn = rates.mean(axis=0), turns.mean(axis=0)
     product = (turns - turn).T @ (rates - rate)
-    power = float(np.sqrt(np.sum((turns - turn) ** 2) * np.sum((rates - rate) ** 2)))
+    turning, shown = float(np.sum((turns - turn) ** 2)), float(np.sum((rates - rate) ** 2))
+    power = float(np.sqrt(turning * shown))
     if given is not None:
         product = product + _GIVEN_WEIGHT * power * given
     left, strengths, right = np.linalg.svd(product)
     sign = np.array([1.0, 1.0, np.linalg.det(left @ right)])
     rotation = left * sign @ right
     common = float(strengths @ sign)
-    scale = np.sqrt(np.sum((rates - rate) ** 2) / max(float(np.sum((turns - turn) ** 2)), 1e-300))
-    return _Match(
-        GyroMount(rotation, rate - rotation.T @ turn, delay),
-        (common / max(power, 1e-300)) ** 2 * np.sign(common),
-        float(scale),
-    )
+    explained = (common / max(power, 1e-300)) ** 2 * np.sign(common)
+    mount = GyroMount(rotation, rate - rotation.T @ turn, delay)
+    return mount, float(explained), float(np.sqrt(shown / max(turning, 1e-300)))
 
 
 def gyro_samples(recording: ImuRecording, start_ns: int) -> GyroSamples:
@@ -154,11 +146,7 @@ class MountFound:
 
 
 def with_gyro(
-    camera: Camera,
-    observations: SplineKeypoints,
-    fitted: Fit,
-    samples: GyroSamples,
-    given: Array | None,
+    observations: SplineKeypoints, fitted: Fit, samples: GyroSamples, given: Array | None
 ) -> tuple[SplineKeypoints, Fit]:
     """Fit the motion again, with a gyroscope and its mount in it.
 
@@ -171,12 +159,12 @@ def with_gyro(
         The observations with the samples and their noise, and the estimate.
 
     Raises:
-        NoMount: when the gyroscope shows other turns than the camera.
-        Undetermined: when the joint system cannot be solved.
+        Undetermined: when the gyroscope shows other turns than the camera, or the joint system
+            cannot be solved.
     """
     mount = first_mount(samples, fitted.state.spline, given)
     guess = replace(fitted, state=replace(fitted.state, mount=mount))
-    samples, joint = _settled(camera, observations, samples, guess)
+    samples, joint = _settled(observations, samples, guess)
     least = _LEAST_SAMPLES * float(np.median(np.diff(samples.times)))
     for _ in range(_MOST_HALVINGS):
         spacing = 0.5 * joint.state.spline.layout.spacing
@@ -184,23 +172,28 @@ def with_gyro(
             break
         finer = replace(joint.state, spline=refined(joint.state.spline, spacing))
         try:
-            quieter, other = _settled(camera, observations, samples, replace(joint, state=finer))
+            quieter, other = _settled(observations, samples, replace(joint, state=finer))
         except Undetermined:
             break
-        if not _worth_it(quieter, other, samples, joint):
+        # Finer knots have to explain more than they cost, by both likelihoods.
+        count = np.count_nonzero(quieter.covered(other.state.spline.layout, 0.0, 0.0))
+        gain = 6.0 * count * np.log(samples.deviation / quieter.deviation)
+        gain += 4.0 * np.count_nonzero(joint.inliers) * np.log(joint.deviation / other.deviation)
+        added = 6 * (len(other.state.spline.positions) - len(joint.state.spline.positions))
+        if not gain > _COST_PER_PARAMETER * added:
             break
         samples, joint = quieter, other
     return replace(observations, gyro=samples), joint
 
 
 def _settled(
-    camera: Camera, observations: SplineKeypoints, samples: GyroSamples, fitted: Fit
+    observations: SplineKeypoints, samples: GyroSamples, fitted: Fit
 ) -> tuple[GyroSamples, Fit]:
     """Return the joint estimate when the noise of the gyroscope no longer changes."""
     samples = _with_noise(samples, fitted)
     for _ in range(_ROUNDS):
         joint = replace(observations, gyro=samples)
-        fitted = fit(camera, joint, fitted.state, fitted.freedom, fitted.deviation)
+        fitted = fit(joint, fitted.state, fitted.freedom, fitted.deviation)
         before, samples = samples.deviation, _with_noise(samples, fitted)
         if abs(samples.deviation - before) < _SETTLED * before:
             break
@@ -212,25 +205,18 @@ def _with_noise(samples: GyroSamples, fitted: Fit) -> GyroSamples:
     return replace(samples, deviation=max(noise, _LEAST_DEVIATION))
 
 
-def _worth_it(quieter: GyroSamples, finer: Fit, samples: GyroSamples, coarser: Fit) -> bool:
-    """Return True if finer knots explain more than they cost, by both likelihoods."""
-    count = np.count_nonzero(quieter.covered(finer.state.spline.layout, 0.0, 0.0))
-    gain = 6.0 * count * np.log(samples.deviation / quieter.deviation)
-    gain += 4.0 * np.count_nonzero(coarser.inliers) * np.log(coarser.deviation / finer.deviation)
-    added = 6 * (len(finer.state.spline.positions) - len(coarser.state.spline.positions))
-    return bool(gain > _COST_PER_PARAMETER * added)
-
-
-def mount_of(camera: Camera, fitted: Fit, samples: GyroSamples, inflation: float) -> MountFound:
+def mount_of(observations: SplineKeypoints, fitted: Fit, inflation: float) -> MountFound:
     """Return the findings of a joint estimate on the IMU.
 
     Args:
-        camera: whose images were stamped when their first row was exposed.
-        samples: with the noise that they turned out to have.
+        observations: of images that were stamped when their first row was exposed, and samples with
+            the noise that they turned out to have.
         inflation: of the deviation of the delay, because parts of the recording disagree.
     """
     mount, covariance = fitted.state.mount, fitted.border_covariance
-    assert mount is not None
+    camera, samples = observations.camera, observations.gyro
+    assert mount
+    assert samples
     deviations = np.sqrt(np.diag(covariance))[-MOUNT:]
     # The spline's time of an image is its stamp at the middle row, the camera's at the first row.
     by_offset, later = np.zeros(len(covariance)), middle_row(camera, fitted.state.readout_time)
@@ -240,13 +226,9 @@ def mount_of(camera: Camera, fitted: Fit, samples: GyroSamples, inflation: float
     return MountFound(
         time_offset=mount.delay + later * fitted.state.readout_time,
         time_offset_deviation=inflation * float(np.sqrt(by_offset @ covariance @ by_offset)),
-        mount=mount,
-        rotation_deviations=deviations[:3],
-        bias_deviations=deviations[3:6],
-        shape_deviations=deviations[DELAY + 1 :],
-        noise=samples.deviation,
-        inflation=inflation,
-    )
+        mount=mount, rotation_deviations=deviations[:3], bias_deviations=deviations[3:6],
+        shape_deviations=deviations[DELAY + 1 :], noise=samples.deviation, inflation=inflation,
+    )  # fmt: skip
 
 
 def middle_row(camera: Camera, readout_time: float) -> float:

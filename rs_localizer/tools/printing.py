@@ -14,17 +14,13 @@ from numpy.typing import NDArray
 from rs_localizer.core.arrays import Array
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.markers.prints import Board, Chessboard, Marker, Pose
+from rs_localizer.markers.prints import Board, Chessboard, Pose
 
 # Upright, in mm.
 PAGES = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
 # mm: printers leave about 5 white; the foot holds a bar to measure and what is said.
 _MARGIN, _FOOT, _BAR = 10.0, 16.0, 100.0
 _MM, _INCH, _PNG_DPI = 1000.0, 25.4, 300
-
-
-class PrintError(ValueError):
-    """Something that cannot be printed; the message says why."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +53,7 @@ def plan(marker_map: MarkerMap, page: str = "a4") -> list[Page]:
         page: one of :data:`PAGES`.
 
     Raises:
-        PrintError: when something is larger than the page.
+        ValueError: when something is larger than the page.
     """
     if marker_map.boards:
         (board,) = marker_map.boards
@@ -66,11 +62,14 @@ def plan(marker_map: MarkerMap, page: str = "a4") -> list[Page]:
     markers = marker_map.markers
     first = markers[0].pose
     of = f"{markers[0].family.name}, {markers[0].size * _MM:g} mm"
-    parts = [_marker(marker) for marker in markers]
+    parts = []  # around the middle of each
+    for marker in markers:
+        side = marker.size * _MM
+        black = _rectangles(pattern(marker.family, marker.id), side / marker.family.cells)
+        parts.append(black - np.array([0.5 * side, 0.5 * side, 0.0, 0.0]))
     places = [(marker.pose.position - first.position) @ first.rotation * _MM for marker in markers]
-    black = np.concatenate(
-        [part + np.array([x, y, 0.0, 0.0]) for part, (x, y, _) in zip(parts, places, strict=True)]
-    )
+    moved = [(x, y, 0.0, 0.0) for x, y, _ in places]
+    black = np.concatenate([part + to for part, to in zip(parts, moved, strict=True)])
     if _paper(black, page) is not None:
         return [_page(black, page, f"{of}, {len(markers)} from id {markers[0].id} on", first)]
     pages = []
@@ -87,7 +86,7 @@ def _page(black: Array, page: str, text: str, pose: Pose) -> Page:
     low, high = black[:, :2].min(axis=0), (black[:, :2] + black[:, 2:]).max(axis=0)
     if paper is None:
         width, height = high - low
-        raise PrintError(
+        raise ValueError(
             f"{text.partition(';')[0]} takes {width:.0f} x {height:.0f} mm, more than {page} has "
             "room for; choose a larger page or a smaller size"
         )
@@ -113,13 +112,6 @@ def _paper(black: Array, page: str) -> tuple[float, float] | None:
 def _room(width: float, height: float) -> tuple[float, float]:
     """Return the part of a sheet (mm) that is left between its margins and above its foot."""
     return width - 2 * _MARGIN, height - 2 * _MARGIN - _FOOT
-
-
-def _marker(marker: Marker) -> Array:
-    """Return the rectangles around the middle of a marker."""
-    side = marker.size * _MM
-    black = _rectangles(pattern(marker.family, marker.id), side / marker.family.cells)
-    return np.asarray(black - np.array([0.5 * side, 0.5 * side, 0.0, 0.0]), np.float64)
 
 
 def _board(board: Board) -> tuple[Array, str]:
@@ -153,10 +145,10 @@ def page_files(path: Path, count: int) -> list[Path]:
     """Return the files of this many pages: one PDF, or a PNG for each.
 
     Raises:
-        PrintError: for another ending.
+        ValueError: for another ending.
     """
     if path.suffix not in (".pdf", ".png"):
-        raise PrintError(f"{path} must end in .pdf or .png")
+        raise ValueError(f"{path} must end in .pdf or .png")
     if count == 1 or path.suffix == ".pdf":
         return [path]
     return [path.with_stem(f"{path.stem}_{k + 1}") for k in range(count)]

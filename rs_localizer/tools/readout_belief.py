@@ -1,9 +1,9 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""When a readout time is believed: deviations, parts, direction and stamps, in one place.
+"""When a readout time is believed: stamps, deviations, and parts of a recording.
 
-By :class:`Evidence` of a calibration, by :class:`ShutterFit` of a map whose shutter nobody knows,
-and by :class:`ReadoutCheck` where one was given.
+By :class:`ShutterFit` of a map whose shutter nobody knows, and by :class:`ReadoutCheck` where one
+was given; :mod:`rs_localizer.tools.camera_calibration` has the evidence of a calibration.
 """
 
 from __future__ import annotations
@@ -100,129 +100,6 @@ def discrepancy(value: float, values: Array, deviations: Array) -> float:
     return math.sqrt(max(float((value - mean) ** 2 - 1.0 / weights.sum()), 0.0))
 
 
-# Parts that differ by this share of the value beyond chance, and by more than a value may be off:
-# the camera may turn its picture.
-_STABILISED = 0.1
-_HALVES_SIGMAS = 3.0
-# A readout time is determined to this part of the interval between images, 1.7 ms at 30 Hz: by the
-# estimate itself a slow motion, which makes it too long, would make it better known. Nor do slow
-# cameras have slow sensors.
-_DETERMINED_SHARE, _LONGEST_INTERVAL = 0.05, 1.0 / 30.0
-# Fewest parts that have to determine it by themselves, or length (s) that the recording has to
-# have.
-_LEAST_TELLING, _LONG = 3, 9.0
-# A global shutter has 0 within this many deviations, and these within this (s): the fastest rolling
-# shutters take 4 ms.
-_GLOBAL_SIGMAS, _GLOBAL = 3.0, 2e-3
-# Images that were exposed so far (s rms) beside their stamps have stamps that no camera gave.
-_BESIDE = 1e-3
-# Readouts cannot take longer than this part of the interval between images.
-_LONGEST = 1.05
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
-    """Findings of a recording on a readout time."""
-
-    readout_time: float  # s; negative: against the scan direction that was given
-    deviation: float  # s, with what blocks and halves disagree in, and doubts of the stamps
-    blocks: tuple[Block, ...]
-    halves: tuple[Block, ...]
-    inflation: float  # of the deviation, because the blocks disagree; 1: they do not
-    stamps: Stamps
-    own_stamps: bool  # the images' own, not those of a rate
-    jitter: float  # s rms, by how much images were exposed beside their stamps; 0: they were not
-    seconds: float  # how long the images with a pose last
-    turned: bool  # whether rows rotate otherwise than images
-
-    @property
-    def limit(self) -> float:
-        """Deviation (s) from which on a readout time is not determined."""
-        return _DETERMINED_SHARE * min(self.stamps.interval, _LONGEST_INTERVAL)
-
-    @property
-    def telling(self) -> int:
-        """How many blocks determine it by themselves."""
-        return sum(block.deviation < self.limit for block in self.blocks)
-
-    @property
-    def determined(self) -> bool:
-        """True where the motion determines the readout time, and parts can speak against it."""
-        long_enough = self.telling >= _LEAST_TELLING or self.seconds >= _LONG
-        return self.deviation < self.limit and long_enough
-
-    @property
-    def near_zero(self) -> bool:
-        """True where 0 lies within the error."""
-        return abs(self.readout_time) < _GLOBAL_SIGMAS * self.deviation
-
-    @property
-    def global_shutter(self) -> bool:
-        """True where nothing else than a global shutter is left."""
-        sure = _GLOBAL_SIGMAS * self.deviation < _GLOBAL and self.inflation == 1.0
-        return self.determined and self.near_zero and sure and self.own_stamps
-
-    @property
-    def sense(self) -> float:
-        """The sign by which readout times of parts are those along the direction that is told."""
-        return 1.0 if self.global_shutter else math.copysign(1.0, self.readout_time)
-
-    @property
-    def stabilised(self) -> bool:
-        """True where the parts disagree as those of a camera that turns its picture do."""
-        least = max(_STABILISED * abs(self.readout_time), self.limit)
-        apart, noise = apart_of(self.halves)
-        by_halves = apart > max(_HALVES_SIGMAS * noise, 2.0 * least)
-        values = [block.readout_time for block in self.blocks]
-        scatter = np.std(values, ddof=1) if len(values) > 1 else 0.0
-        return bool((self.inflation > 1.0 and scatter > least) or by_halves)
-
-    @property
-    def processed(self) -> str:
-        """Why the film is hardly what the camera saw, one sentence; '': nothing says so."""
-        why = []
-        if self.stabilised:
-            parts = ", ".join(f"{1e3 * self.sense * one.readout_time:.2f}" for one in self.blocks)
-            why.append(f"parts of the recording disagree ({parts} ms)")
-        if self.jitter > _BESIDE:
-            why.append(f"exposures are {1e3 * self.jitter:.1f} ms rms off their stamps")
-        if self.turned:
-            why.append("rows rotate otherwise than images")
-        return (
-            f"{' and '.join(why)}: is image stabilization on, or was the video processed? Record "
-            "with the camera's own time stamps, without losing images or re-encoding the video"
-            if why
-            else ""
-        )
-
-    @property
-    def disbelief(self) -> str:
-        """One line with the figure when the readout time is not determined; or ''."""
-        interval = 1e3 * self.stamps.interval
-        slowest = abs(self.readout_time) + _GLOBAL_SIGMAS * self.deviation
-        if self.processed:
-            why = f"; {self.processed}"
-        elif abs(self.readout_time) > _LONGEST * self.stamps.interval:
-            why = f" is longer than {interval:.1f} ms between images: is the frame rate right?"
-        elif not self.determined:
-            why = (
-                f" (limit {1e3 * self.limit:.1f} ms; {self.telling} of {len(self.blocks)} parts of "
-                f"the {self.seconds:.1f} s determine it on their own, three must, or 9 s): move "
-                "the camera faster, rotate it about all axes, and for longer"
-            )
-        elif not (self.near_zero or self.own_stamps) and slowest < _GLOBAL:
-            why = "; no rolling shutter is that fast: was the video stabilized or processed?"
-        elif self.near_zero and not self.global_shutter:
-            why = (
-                "; that is no proof of a global shutter: three deviations are more than 2 ms, its "
-                "parts differ, or the stamps are those of a video that was processed"
-            )
-        else:
-            return ""
-        value = 1e3 * self.sense * self.readout_time
-        return f"not observable: {value:.1f} +- {1e3 * self.deviation:.1f} ms{why}"
-
-
 def apart_of(halves: tuple[Block, ...]) -> tuple[float, float]:
     """Return the difference of the readout times of two halves, and its deviation (s)."""
     if len(halves) < 2:
@@ -286,3 +163,8 @@ class ReadoutCheck:
             f"estimated readout time is {1e3 * abs(self.estimated):.1f} ms{reverse}, but "
             f"{1e3 * self.given:.1f} ms was given; a wrong value distorts the map"
         )
+
+    def refuse(self) -> None:
+        """Raise ValueError where it differs: a map with it is bent, by more than it knows."""
+        if self.differs:
+            raise ValueError(f"{self.message}; -p readout_time:=0.0 estimates it")

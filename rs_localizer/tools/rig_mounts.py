@@ -22,14 +22,13 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.tools.adjust.cluster_robust import cluster_robust
-from rs_localizer.tools.adjust.fit import Fit, solve
+from rs_localizer.tools.adjust.fit import Fit, cluster_robust, solve
 from rs_localizer.tools.adjust.intrinsics import with_lens
 from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.row_kernels import EXTRINSICS
 from rs_localizer.tools.adjust.spline import Spline, refined
 from rs_localizer.tools.adjust.system import Undetermined
-from rs_localizer.tools.adjust.variables import CameraView, Extrinsics, Freedom, Unknowns
+from rs_localizer.tools.adjust.variables import CameraView, Extrinsics, Unknowns
 from rs_localizer.tools.camera_calibration import CameraCalibration, cut
 from rs_localizer.tools.imu_mount import middle_row
 from rs_localizer.tools.readout_belief import disagreement, discrepancy
@@ -49,13 +48,6 @@ makes 0.1 deg of 1.5 ms, and frames of a pair notice extrinsics that are 0.2 deg
 """
 
 
-class Recording(NamedTuple):
-    """One camera's part: its calibration and its recording."""
-
-    camera: Camera
-    calibration: CameraCalibration
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Mounted:
     """A camera of a rig, estimated from all recordings, in the axes of the first camera."""
@@ -69,11 +61,7 @@ class Mounted:
     @property
     def undetermined(self) -> str:
         """Names and figures of what the recording does not determine; empty: all is."""
-        units = (
-            ("rotation", np.degrees(1.0), "deg"),
-            ("position", 1e3, "mm"),
-            ("clock", 1e3, "ms"),
-        )
+        units = ("rotation", np.degrees(1.0), "deg"), ("position", 1e3, "mm"), ("clock", 1e3, "ms")
         largest = (float(np.max(of)) for of in np.split(self.deviations, [3, 6]))
         return ", ".join(
             f"{name} +- {unit * value:.2g} {of} (limit {unit * limit:.2g})"
@@ -82,52 +70,50 @@ class Mounted:
         )
 
 
-def calibrate_rig(recordings: Mapping[str, Recording]) -> dict[str, Mounted]:
+def calibrate_rig(found: Mapping[str, CameraCalibration]) -> dict[str, Mounted]:
     """Estimate extrinsics and clock offsets of a rig, by axes and clock of the first camera.
+
+    Args:
+        found: each camera's own calibration, by names.
 
     Raises:
         ValueError: for a single camera, or when the motions of two cameras are not one, or do not
             determine how the cameras are mounted; the message names the camera.
     """
-    if len(recordings) < 2:
-        raise ValueError(f"a rig has several cameras, not {len(recordings)}")
-    first, *_ = recordings
-    own = recordings[first].calibration
+    if len(found) < 2:
+        raise ValueError(f"a rig has several cameras, not {len(found)}")
+    first, *_ = found
+    own = found[first]
     spline, start_ns = own.fit.state.spline, own.posed.start_ns
-    spacing = min(each.calibration.fit.state.spline.layout.spacing for each in recordings.values())
+    spacing = min(each.fit.state.spline.layout.spacing for each in found.values())
     if spacing < spline.layout.spacing:
         spline = refined(spline, spacing)
-    cameras: list[CameraView] = []
-    states: list[Unknowns] = []
-    for name, (camera, calibration) in recordings.items():
+    cameras, states = list[CameraView](), list[Unknowns]()
+    for name, calibration in found.items():
         state, shift = calibration.fit.state, 1e-9 * (calibration.posed.start_ns - start_ns)
-        freedom = _freedom(own, calibration)
+        # That of the camera's own calibration, with the accelerations of the rig.
+        kept = ("lens", "lens_deviations", "landmarks", "paper", "stamps")
+        alone = {of: getattr(calibration.fit.freedom, of) for of in kept}
+        freedom = replace(own.fit.freedom, mount=name != first, **alone)
         if name != first:
             try:
                 extrinsics = first_extrinsics(spline, state.spline, shift)
             except Undetermined as error:
                 raise ValueError(f"{name}: {error}") from error
             state = replace(state, extrinsics=extrinsics)
-            freedom = replace(freedom, mount=True)
         seen = calibration.posed.observations
         seen = replace(seen, times=seen.times + shift)
         seen = seen.subset(spline.layout.inside(seen.times + state.extrinsics.offset))
         states.append(replace(state, spline=spline, mount=None))
-        cameras.append(CameraView(camera, seen, freedom))
-    noises = np.array([each.calibration.fit.deviation for each in recordings.values()])
+        cameras.append(CameraView(seen, freedom))
+    noises = np.array([each.fit.deviation for each in found.values()])
     start = replace(states[0], others=tuple(states[1:]))
     try:
         whole = _Joint.of(Problem(cameras, start, noises), start)
     except Undetermined as error:
-        raise ValueError(f"{', '.join(recordings)}: {error}") from error
+        raise ValueError(f"{', '.join(found)}: {error}") from error
     parts = list(_parts(whole))
-    return {name: _mounted(place, whole, parts) for place, name in enumerate(recordings)}
-
-
-def _freedom(first: CameraCalibration, own: CameraCalibration) -> Freedom:
-    """Return the freedom of a camera's own calibration, with the accelerations of the rig."""
-    names = ("lens", "lens_deviations", "landmarks", "paper", "stamps")
-    return replace(first.fit.freedom, **{name: getattr(own.fit.freedom, name) for name in names})
+    return {name: _mounted(place, whole, parts) for place, name in enumerate(found)}
 
 
 def first_extrinsics(rig: Spline, own: Spline, shift: float) -> Extrinsics:
@@ -155,9 +141,7 @@ def first_extrinsics(rig: Spline, own: Spline, shift: float) -> Extrinsics:
     peaks = argrelmax(alike, mode="wrap")[0]
     peaks = peaks[alike[peaks] > 0.0]
     lags = correlation_lags(len(speeds), len(own_speeds))[peaks[np.argsort(-alike[peaks])[:_TRIED]]]
-    guesses = [
-        _at_offset(rig, own, begin - own_begin + float(lag) * _STEP) for lag in lags.tolist()
-    ]
+    guesses = [_at_offset(rig, own, begin - own_begin + lag * _STEP) for lag in lags.tolist()]
     best, turned = min(guesses, key=lambda guess: guess[1], default=(None, math.inf))
     if best is None or not turned < _MOST_TURNED:
         raise Undetermined(

@@ -19,7 +19,6 @@ import numpy as np
 from rs_localizer.config import PoseTime
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
-from rs_localizer.core.camera import Camera
 from rs_localizer.core.rig import Rig, RigEstimate
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
@@ -90,8 +89,8 @@ _ROUGH = 2e-3
 # deg at 60 Hz all do, by 1.3 to 5.4 times.
 _IN_FRAME, _NEXT = 1.0, 9
 _ROWS = np.linspace(-0.5, 0.5, 17)
-Parts = list[tuple[Camera, SplineKeypoints]]
-"""The keypoints of each camera."""
+Parts = list[SplineKeypoints]
+"""Keypoints of each camera."""
 # The expected accelerations are settled when they change by less than this part.
 _ALIKE, _ROUNDS = 0.05, 6
 
@@ -119,26 +118,20 @@ class Smoothed:
     def sample(self, stamps_ns: IntArray) -> Sampled:
         """Return the camera's motion at times (m,) in ns."""
         times = np.array([(int(stamp) - self.start_ns) * 1e-9 for stamp in stamps_ns])
-        spline = self.fit.state.spline
         covariances = self._in_camera(times)
         usual = np.median(_deviations(self._in_camera(self.times)), axis=0)
         certain = np.all(_deviations(covariances) < _MOST_UNCERTAIN * usual, axis=1)
+        last = len(self.times) - 1
+        before = np.maximum(np.searchsorted(self.times, times, side="right") - 1, 0)
+        after = np.minimum(np.searchsorted(self.times, times), last)
+        following = np.clip(after, 1, last)
+        apart = self.times[following] - self.times[following - 1]
+        vibrates = self.shaken[before] | self.shaken[after]
         return Sampled(
             self._estimates(times, covariances),
-            spline.layout.inside(times) & certain & ~self._beside_shaken(times),
-            self._apart(times) > _BRIDGED * np.median(np.diff(self.times)),
+            self.fit.state.spline.layout.inside(times) & certain & ~vibrates,
+            apart > _BRIDGED * np.median(np.diff(self.times)),
         )
-
-    def _beside_shaken(self, times: Array) -> BoolArray:
-        """Return a mask of times (m,) beside an image that vibrates."""
-        after = np.clip(np.searchsorted(self.times, times), 0, len(self.times) - 1)
-        before = np.maximum(np.searchsorted(self.times, times, side="right") - 1, 0)
-        return self.shaken[before] | self.shaken[after]
-
-    def _apart(self, times: Array) -> Array:
-        """Return the interval (m,) between the images around these times, s."""
-        after = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
-        return self.times[after] - self.times[after - 1]
 
     def _in_camera(self, times: Array) -> Array:
         """Return covariances (m,12,12) in order and axes of ``Estimate.covariance``, SI."""
@@ -163,15 +156,11 @@ class Smoothed:
         joint[:, :MOTION_PARAMETERS, :MOTION_PARAMETERS] = scale[:, None] * covariances * scale
         return [
             Estimate(
-                rotation=rotation.T,
-                translation=-rotation.T @ position,
+                rotation=rotation.T, translation=-rotation.T @ position,
                 angular_velocity=self.readout_time * angular,
                 linear_velocity=self.readout_time * (rotation.T @ linear),
-                inliers=empty.astype(np.bool_),
-                residuals=empty,
-                joint_covariance=covariance,
-                iterations=0,
-                span=self.readout_time,
+                inliers=empty.astype(np.bool_), residuals=empty, joint_covariance=covariance,
+                iterations=0, span=self.readout_time,
             )
             for rotation, position, angular, linear, covariance in zip(
                 states.rotations, states.positions, states.angular, states.linear, joint,
@@ -182,10 +171,8 @@ class Smoothed:
 
 def _deviations(covariances: Array) -> Array:
     """Return standard deviations (m,2) of orientation and position."""
-    variances = np.diagonal(covariances, axis1=1, axis2=2)
-    sums = np.column_stack([variances[:, :3].sum(axis=1), variances[:, 3:6].sum(axis=1)])
-    deviations: Array = np.sqrt(sums)
-    return deviations
+    variances = np.diagonal(covariances, axis1=1, axis2=2)[:, :6]
+    return np.asarray(np.sqrt(variances.reshape(-1, 2, 3).sum(axis=2)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,14 +201,16 @@ def smooth(rig: Rig, frames: list[PosedFrame]) -> Smoothed:
         raise ValueError("no image has a pose: there is nothing to smooth")
     start_ns, estimates = frames[0].time_ns, [frame.estimate for frame in frames]
     times = np.array([(frame.time_ns - start_ns) * 1e-9 for frame in frames])
-    spacing, fading = _knots(times)
+    interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    fading = _FADING if interval < 0.5 * _FADING else 0.0  # 0: accelerations never fade
+    spacing = min(_NARROW_SPACING if fading else LONGEST_SPACING, interval)
     rotations = np.array([one.rotation.T for one in estimates])
     positions = np.array([one.position for one in estimates])
     parts, mounted = _parts(rig, frames, start_ns)
     longest = max(readout_time, *(one.span for one in estimates))
     spline = first_spline(times, rotations, positions, spacing, longest)
-    parts = [(one, of.subset(spline.layout.inside(of.times))) for one, of in parts]
-    start = rig_state(spline, ((*part, one) for part, one in zip(parts, mounted, strict=True)))
+    parts = [seen.subset(spline.layout.inside(seen.times)) for seen in parts]
+    start = rig_state(spline, zip(parts, mounted, strict=True))
     best = _best(parts, start, fading)
     shaken = _shaken(best, parts, rig.focal_length, estimates)
     if shaken.mean() > _MOST_SHAKEN:
@@ -230,9 +219,8 @@ def smooth(rig: Rig, frames: list[PosedFrame]) -> Smoothed:
 
 
 def _parts(rig: Rig, frames: list[PosedFrame], start_ns: int) -> tuple[Parts, list[Extrinsics]]:
-    """Return the cameras that saw something, with their keypoints and mounts."""
-    parts: Parts = []
-    mounted: list[Extrinsics] = []
+    """Return keypoints and mounts of the cameras that saw something."""
+    parts, mounted = list[SplineKeypoints](), list[Extrinsics]()
     for name, camera in rig.cameras.items():
         own = [k for k, frame in enumerate(frames) if name in frame.images]
         if not own:
@@ -244,40 +232,31 @@ def _parts(rig: Rig, frames: list[PosedFrame], start_ns: int) -> tuple[Parts, li
         ]
         posed = collect(camera, images, list(known), -camera.readout_time * camera.first_row_time)
         seen, shift = posed.observations, (posed.start_ns - start_ns) * 1e-9
-        parts.append(
-            (camera, replace(seen, times=seen.times + shift, frames=np.array(own)[seen.frames]))
-        )
+        frames_of = np.array(own)[seen.frames]
+        parts.append(replace(seen, times=seen.times + shift, frames=frames_of))
         axes, moved = rig.camera_from_rig[name]
         mounted.append(Extrinsics(axes, -axes.T @ moved, 0.0))
     return parts, mounted
 
 
-def _knots(times: Array) -> tuple[float, float]:
-    """Return the spacing of knots, and the fading of accelerations (0: never), s."""
-    interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
-    fading = _FADING if interval < 0.5 * _FADING else 0.0
-    return min(_NARROW_SPACING if fading else LONGEST_SPACING, interval), fading
-
-
-def _problem(parts: Parts, state: Unknowns, freedom: Freedom) -> Problem:
-    return Problem([CameraView(*part, freedom) for part in parts], state)
-
-
 def _best(parts: Parts, start: Unknowns, fading: float) -> Fit:
     """Fit with the accelerations that the motion shows, and finer knots if worth it."""
-    freedom = Freedom(readout_time=False, fading=fading)
-    fitted = _lively(parts, solve(_problem(parts, start, freedom), start))
+    fitted = _lively(parts, _solved(parts, start, Freedom(readout_time=False, fading=fading)))
     spline = fitted.state.spline
     halved = replace(fitted.state, spline=refined(spline, 0.5 * spline.layout.spacing))
-    finer = solve(_problem(parts, halved, fitted.freedom), halved, fitted.deviation)
-    finer = _lively(parts, finer)
+    finer = _lively(parts, _solved(parts, halved, fitted.freedom, fitted.deviation))
     more = np.sum(squares_and_numbers(finer)[1]) - np.sum(squares_and_numbers(fitted)[1])
     return finer if cheaper(finer, fitted, float(more)) else fitted
 
 
+def _solved(parts: Parts, start: Unknowns, freedom: Freedom, deviation: float | None = None) -> Fit:
+    views = [CameraView(part, freedom) for part in parts]
+    return solve(Problem(views, start), start, deviation)
+
+
 def _shaken(fitted: Fit, parts: Parts, focal_length: float, estimates: list[Estimate]) -> BoolArray:
     """Return a mask (f,) of images with vibration that the motion does not follow."""
-    frames = np.concatenate([seen.frames for _, seen in parts])
+    frames = np.concatenate([seen.frames for seen in parts])
     own = np.array([max(one.residual_rms, fitted.freedom.least_noise) ** 2 for one in estimates])
     count = np.bincount(frames, minlength=len(estimates))
     # Robust, as the estimates are: outliers of the motion count as its limit.
@@ -314,8 +293,7 @@ def _lively(parts: Parts, fitted: Fit) -> Fit:
         known = np.maximum(numbers, 0.0) + _NUMBERS
         angular, linear = np.sqrt((squares + _NUMBERS * _USUAL**2) / known).tolist()
         freedom = replace(before, angular_acceleration=angular, linear_acceleration=linear)
-        problem = _problem(parts, fitted.state, freedom)
-        fitted = solve(problem, fitted.state, fitted.deviation)
+        fitted = _solved(parts, fitted.state, freedom, fitted.deviation)
         changed = angular / before.angular_acceleration, linear / before.linear_acceleration
         if np.all(np.abs(np.log(changed)) < _ALIKE):
             break
@@ -333,11 +311,9 @@ class SmoothedFrames:
 
 
 def smooth_frames(
-    localizer: FrameLocalizer,
-    localized: Iterable[Localized],
-    stamps_ns: list[int],
+    localizer: FrameLocalizer, localized: Iterable[Localized], stamps_ns: list[int],
     rate: float | None,
-) -> SmoothedFrames:
+) -> SmoothedFrames:  # fmt: skip
     """Return the frames of a recording again, with their common motion.
 
     Args:
@@ -365,17 +341,13 @@ def smooth_frames(
     sampled = motion.sample(moments)
     own_poses = {f.input_stamp_ns for f, of in zip(frames, motion.shaken, strict=True) if of}
     result, kept, shaken = [], np.zeros(len(moments), dtype=np.bool_), 0
-    for k, estimate in enumerate(sampled.estimates):
-        stamp = int(inputs[k])
+    for k, (stamp, estimate) in enumerate(zip(inputs.tolist(), sampled.estimates, strict=True)):
         own = once.get(stamp)
+        frame: Localized | Refusal | None = None
         if own is not None and (stamp in own_poses or not sampled.determined[k]):
-            result.append(own)
-            kept[k], shaken = True, shaken + 1
-            continue
-        if not sampled.determined[k]:
-            continue
-        frame = localizer.mounted(
-            Localized(
+            frame, shaken = own, shaken + 1
+        elif sampled.determined[k]:
+            frame = localizer.mounted(Localized(
                 input_stamp_ns=stamp,
                 stamp_ns=int(moments[k]),
                 map_frame=frames[0].map_frame,
@@ -386,9 +358,8 @@ def smooth_frames(
                 dropped=0 if own is None else own.dropped,
                 estimate=estimate,
                 cameras=() if own is None else own.cameras,
-            )
-        )
-        if not isinstance(frame, Refusal):
+            ))  # fmt: skip
+        if frame:
             result.append(frame)
             kept[k] = True
     without = sampled.bridged if rate is not None else ~np.isin(inputs, list(once))
@@ -402,35 +373,31 @@ def _motion(
     """Return the motion through frames, and the moments (m,) ns published of inputs (m,)."""
     config, calibration = localizer.config, localizer.calibration
     if isinstance(localizer, RigFrames):
-        rig, posed = localizer.rig, [_rig_frame(frame) for frame in frames]
-        if config.pose_time != PoseTime.MID_FRAME:
-            return smooth(rig, posed), inputs
+        rig, offset_ns, delay_ns = localizer.rig, 0, 0
+    else:
+        assert calibration is not None
+        camera = calibration.camera(config.readout_time, config.scan_direction)
+        rig, offset_ns = Rig.of(camera), round(1e9 * config.stamp_offset)
+        delay_ns = round(-1e9 * camera.readout_time * camera.first_row_time)
+    posed = []
+    for frame in frames:
+        points, pixels = (inlier_columns(frame, names) for names in ("xyz", "uv"))
+        if isinstance(frame.estimate, RigEstimate):
+            ends = np.cumsum([share.inliers for share in frame.cameras])[:-1]
+            parts = zip(frame.cameras, np.split(points, ends), np.split(pixels, ends), strict=True)
+            images = {share.name: ImagePoints(share.start_ns, *own) for share, *own in parts}
+            # Times of a rig's estimate count from its first image.
+            time_ns = frame.cameras[0].start_ns + round(1e9 * frame.estimate.time)
+        else:
+            start_ns = frame.input_stamp_ns + offset_ns
+            (name,), time_ns = rig.cameras, start_ns + delay_ns
+            images = {name: ImagePoints(start_ns, points, pixels)}
+        posed.append(PosedFrame(time_ns, images, frame.estimate))
+    if not isinstance(localizer, RigFrames):
+        return smooth(rig, posed), inputs + published_moment(config, camera, 0)[0]
+    if config.pose_time == PoseTime.MID_FRAME:
         pairs = zip(frames, posed, strict=True)
         delays = {f.input_stamp_ns: r.time_ns - f.input_stamp_ns for f, r in pairs}
         usual = round(float(np.median(list(delays.values()))))
-        moments = inputs + np.array([delays.get(stamp, usual) for stamp in inputs.tolist()])
-        return smooth(rig, posed), moments
-    assert calibration is not None
-    camera = calibration.camera(config.readout_time, config.scan_direction)
-    rig, offset_ns = Rig.of(camera), round(1e9 * config.stamp_offset)
-    delay_ns = round(-1e9 * camera.readout_time * camera.first_row_time)
-    (name,), posed = rig.cameras, []
-    for frame in frames:
-        start_ns = frame.input_stamp_ns + offset_ns
-        points, pixels = (inlier_columns(frame, names) for names in ("xyz", "uv"))
-        image = ImagePoints(start_ns, points, pixels)
-        posed.append(PosedFrame(start_ns + delay_ns, {name: image}, frame.estimate))
-    return smooth(rig, posed), inputs + published_moment(config, camera, 0)[0]
-
-
-def _rig_frame(frame: Localized) -> PosedFrame:
-    assert isinstance(frame.estimate, RigEstimate)
-    counts = np.cumsum([share.inliers for share in frame.cameras])[:-1]
-    points, pixels = (np.split(inlier_columns(frame, names), counts) for names in ("xyz", "uv"))
-    images = {
-        share.name: ImagePoints(share.start_ns, *own)
-        for share, *own in zip(frame.cameras, points, pixels, strict=True)
-    }
-    # Times of a rig's estimate count from its first image.
-    time_ns = frame.cameras[0].start_ns + round(1e9 * frame.estimate.time)
-    return PosedFrame(time_ns, images, frame.estimate)
+        inputs = inputs + np.array([delays.get(stamp, usual) for stamp in inputs.tolist()])
+    return smooth(rig, posed), inputs

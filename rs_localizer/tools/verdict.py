@@ -20,8 +20,8 @@ from rs_localizer.tools.rig_mounts import Mounted
 _WORTH_A_WORD = 5e-4
 # Ninths of the image by row; one in which no keypoint lies is a guess of the lens.
 _REGIONS = (
-    ("top left", "top", "top right"), ("left", "middle", "right"),
-    ("bottom left", "bottom", "bottom right"),
+    "top left", "top", "top right", "left", "middle", "right", "bottom left", "bottom",
+    "bottom right",
 )  # fmt: skip
 # A rotation that TF has otherwise by more than this (degrees), and more than chance, is doubted.
 _MOST_TURN, _SIGMAS = 1.0, 4.0
@@ -63,12 +63,9 @@ def shape_is_free(result: CameraCalibration) -> bool:
 
 def moved(result: CameraCalibration, points: Array) -> Array:
     """Return points (n,3) of the map where they were found; unseen ones stay."""
-    rows = {tuple(place): row for row, place in enumerate(result.posed.observations.landmarks)}
-    places = [rows.get(tuple(point)) for point in points]
-    return np.array([
-        point if row is None else result.fit.state.landmarks[row]
-        for point, row in zip(points, places, strict=True)
-    ])  # fmt: skip
+    given, found = result.posed.observations.landmarks, result.fit.state.landmarks
+    places = dict(zip(map(tuple, given), found, strict=True))
+    return np.array([places.get(tuple(point), point) for point in points])
 
 
 def remarks(result: CameraCalibration) -> Iterator[str]:
@@ -100,13 +97,8 @@ def remarks(result: CameraCalibration) -> Iterator[str]:
     observations = result.posed.observations
     pixels = observations.pixels[observations.trusted]
     cells = (3.0 * pixels / result.fit.camera.size).astype(int).clip(0, 2)
-    shown = {(row, column) for column, row in cells.tolist()}
-    if empty := [
-        name
-        for row, names in enumerate(_REGIONS)
-        for column, name in enumerate(names)
-        if (row, column) not in shown
-    ]:
+    shown = {3 * row + column for column, row in cells.tolist()}
+    if empty := [name for place, name in enumerate(_REGIONS) if place not in shown]:
         yield f"never showed the map: {', '.join(empty)} of the image; the lens is a guess there"
 
 
@@ -180,10 +172,7 @@ def of_imu(found: CameraCalibration, imu: ImuRecording, stamp_offset: float) -> 
     bias, errors = (_numbers(np.degrees(each), 3) for each in (one.mount.bias, one.bias_deviations))
     for name, text, known in (
         ("imu.time_offset", f"{offset:+.3f} +- {spread:.3f} ms", one.time_offset_determined),
-        (
-            "rotation camera <- imu", f"{turn} (x y z w) +- {error} deg",
-            one.rotation_determined,
-        ),
+        ("rotation camera <- imu", f"{turn} (x y z w) +- {error} deg", one.rotation_determined),
         ("gyroscope bias", f"{bias} +- {errors} deg/s", one.bias_determined),
     ):  # fmt: skip
         yield f"{name:26} {text if known else f'not observable: {text}'}"

@@ -12,7 +12,7 @@ from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.markers.prints import Charuco, Chessboard
-from rs_localizer.tools.printing import PAGES, PrintError, largest_side, plan, write_pages
+from rs_localizer.tools.printing import PAGES, largest_side, plan, write_pages
 
 PIXEL = 0.0254 / 300  # m, of the PNG files
 
@@ -50,7 +50,7 @@ def test_markers_that_do_not_fit_together_get_pages_of_their_own(tmp_path):
     assert found.ids.tolist() == [4, 5, 6, 7]
     side = np.linalg.norm(found.pixels[0] - found.pixels[1]) * PIXEL
     assert side == pytest.approx(0.12, abs=3e-5)
-    with pytest.raises(PrintError, match="takes 400 x 400 mm, more than a4 has room for"):
+    with pytest.raises(ValueError, match="takes 400 x 400 mm, more than a4 has room for"):
         plan(MarkerMap(wall("4x4_50", (1, 1), 0.4, 0.1)))
 
 

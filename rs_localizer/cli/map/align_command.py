@@ -18,7 +18,7 @@ if WORKING:
     from scipy.spatial.transform import Rotation
 
     from rs_localizer.io.maps.landmarks import Map, make_map
-    from rs_localizer.tools.mapping.align import alignment, moved
+    from rs_localizer.tools.mapping.gauge import alignment, moved_map
 
 _OUTPUTS = (SUFFIX, ".yaml", ".yml")
 
@@ -55,7 +55,7 @@ def run(options: Options) -> info_command.Figures:
         turn = np.degrees(Rotation.from_matrix(by.rotation).magnitude())
         shift = ", ".join(f"{value:.4f}" for value in by.translation)
         print(f"scaled by {by.scale:.6g}, rotated by {turn:.3f} deg, shifted by ({shift}) m")
-        any_map = moved(any_map, by)
+        any_map = moved_map(any_map, by)
     figures = info_command.describe(options.file, any_map, kind)
 
     def write(part: Path) -> None:

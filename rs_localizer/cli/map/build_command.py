@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -16,8 +17,7 @@ from rs_localizer.cli.recording_input import (
     ImageOptions,
     check_there,
     opened,
-    print_left_out,
-    print_times,
+    print_images,
     shutter_values,
 )
 from rs_localizer.config import FeatureConfig
@@ -33,10 +33,14 @@ if WORKING:
     from rs_localizer.markers.map_files import read_marker_map
     from rs_localizer.settings import build, write_parameters
     from rs_localizer.tools.mapping.anchors import Anchors, Distance, PointSight
-    from rs_localizer.tools.mapping.build import Built, Given, build_map
-    from rs_localizer.tools.mapping.report import advice, rows
-    from rs_localizer.tools.mapping.seen_images import Looked, Looker, look_through
-    from rs_localizer.tools.mapping.structure import require
+    from rs_localizer.tools.mapping.build import (
+        Built,
+        Given,
+        build_map,
+        filming_advice,
+        result_rows,
+    )
+    from rs_localizer.tools.mapping.structure import Looked, Looker, look_through, require
 
 
 def shutter_of(args: Options) -> tuple[float | None, str | None]:
@@ -62,8 +66,8 @@ def look_at_images(args: Options, points: Sequence[_Point], looker: Looker) -> L
     for name, seconds, *_ in points:
         if seconds not in looked.moments:
             raise UsageError(f"--point {name}: the images end before {seconds:g} s")
-    print_left_out(looked.refused)
-    print_times(source.clock, build(shutter_values(args)).readout_time, looked.period)
+    readout_time = build(shutter_values(args)).readout_time
+    print_images(looked.refused, source.clock, readout_time, looked.period)
     return looked
 
 
@@ -88,7 +92,8 @@ class Options(ImageOptions, ResultOptions):
 
 
 def run(args: Options) -> None:
-    points = _points(args)
+    of_point = partial(_number, "--point")
+    points = [(name, of_point(s), of_point(u), of_point(v)) for name, s, u, v in args.point]
     distances = _distances(args, [name for name, *_ in points])
     require()
     check_there([args.recording])
@@ -109,13 +114,6 @@ def run(args: Options) -> None:
             built = build_map(inputs, folder, stage)
         _write(out, built, looked)
     _print_result(args, built, looked)
-
-
-def _points(options: Options) -> list[_Point]:
-    return [
-        (name, _number("--point", seconds), _number("--point", u), _number("--point", v))
-        for name, seconds, u, v in options.point
-    ]
 
 
 def _distances(options: Options, names: list[str]) -> list[Distance]:
@@ -162,7 +160,7 @@ def _write(out: Path, built: Built, looked: Looked) -> None:
 
 def _print_result(args: Options, built: Built, looked: Looked) -> None:
     print(args.out / MAP)
-    for name, text in rows(built, looked.images, len(looked.views)).items():
+    for name, text in result_rows(built, looked.images, len(looked.views)).items():
         print(f"  {name:30} {text}")
     if not built.placement.scaled:
         print(
@@ -173,7 +171,7 @@ def _print_result(args: Options, built: Built, looked: Looked) -> None:
         print(f"warning: {built.readout_check.message}; the map has what was estimated")
     if built.placement.doubt:
         print(f"warning: {built.placement.doubt}")
-    for text in advice(built, looked.views):
+    for text in filming_advice(built, looked.views):
         print(f"to film otherwise: {text}")
     following = typed("rs_localizer", "replay", "IMAGES", "--map", str(args.out), "--out", "poses")
     print(f"next, for images of another walk: {following}")

@@ -11,10 +11,14 @@ from functools import partial
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, earlier_result, refuse_existing, write_all
-from rs_localizer.cli.map import check_readout
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
-from rs_localizer.cli.recording_input import LensOptions, given_lens, recorded
-from rs_localizer.cli.settings_args import given_settings, given_values
+from rs_localizer.cli.recording_input import (
+    LensOptions,
+    given_lens,
+    given_settings,
+    given_values,
+    recorded,
+)
 from rs_localizer.io.maps.files import SUFFIX, read_map_file, write_npz
 
 if WORKING:
@@ -70,8 +74,7 @@ def run(args: Options) -> None:
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
     with open_bag(args.recording) as bag:
         lens, clouds = recorded(args, bag, config, landmarks)
-    axis = config.scan_direction
-    camera = replace(lens, readout_time=config.readout_time, scan_direction=axis)
+    camera = replace(lens, readout_time=config.readout_time, scan_direction=config.scan_direction)
     with tqdm(total=len(clouds), unit="image", desc="localize", disable=None) as bar:
         localized = from_recording(camera, clouds, landmarks, bar.update)
     deviations = _deviations(args, localized.landmarks, config.map_deviation)
@@ -83,7 +86,8 @@ def run(args: Options) -> None:
         done=_step,
     )  # fmt: skip
     _print_result(localized, refined)
-    check_readout(refined.readout_check)
+    if refined.readout_check is not None:
+        refined.readout_check.refuse()
     _write(args, args.out, localized.landmarks, refined)
 
 
@@ -160,7 +164,8 @@ def _undo_shutter(args: Options, folder: Path, out: Path) -> None:
     shutter = config.readout_time or None, str(config.scan_direction) if known else None
     with atomic_directory(out, earlier_result(args, "images.txt", out)) as built:
         result = undo_shutter(camera, model, stamps, shutter, args.intrinsics, _step)
-        check_readout(result.readout_check)
+        if result.readout_check is not None:
+            result.readout_check.refuse()
         built.mkdir()
         write_model(built, result.camera, result.images, result.points)
     _print_model(result, len(model.images), len(model.points))

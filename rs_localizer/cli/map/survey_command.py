@@ -9,10 +9,8 @@ from functools import partial
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, refuse_existing, write_all
-from rs_localizer.cli.map import check_readout
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
-from rs_localizer.cli.recording_input import ImageOptions, each_image
-from rs_localizer.cli.settings_args import given_settings
+from rs_localizer.cli.recording_input import ImageOptions, each_image, given_settings
 from rs_localizer.markers.families import FAMILIES, Family, family
 
 if WORKING:
@@ -50,20 +48,17 @@ def run(args: Options) -> None:
     if args.out.suffix not in (".yaml", ".yml"):
         raise UsageError(f"--out must end in .yaml, got {args.out}")
     config, markers = given_settings(args), _markers(args)
-    origin = None
-    if args.origin is not None:
-        origin = next((k for k, marker in enumerate(markers) if marker.id == args.origin), None)
-        if origin is None:
-            raise UsageError(f"--origin: {' and '.join(args.family)} have no id {args.origin}")
+    origin = next((k for k, marker in enumerate(markers) if marker.id == args.origin), None)
+    if args.origin is not None and origin is None:
+        raise UsageError(f"--origin: {' and '.join(args.family)} have no id {args.origin}")
     refuse_existing(args)
     filmed = _filmed(args, config, Spotter(markers))
     found = survey(filmed, markers, origin=origin)
-    every = found.deviations_of_shape
     _print_result(found, len(filmed.spotted))
-    check_readout(found.shutter.readout_check)
-    pairs = zip(found.markers, every, strict=True)
-    surveyed = tuple(replace(marker, deviations=deviations) for marker, deviations in pairs)
-    marker_map = MarkerMap(surveyed)
+    if found.shutter.readout_check is not None:
+        found.shutter.readout_check.refuse()
+    pairs = zip(found.markers, found.deviations_of_shape, strict=True)
+    marker_map = MarkerMap(tuple(replace(one, deviations=spread) for one, spread in pairs))
     write_all({args.out: partial(write_marker_map, marker_map=marker_map)})
 
 
@@ -125,12 +120,18 @@ def _print_result(found: Survey, images: int) -> None:
         found.markers, found.sights, found.deviations_of_shape, found.poor, strict=True
     ):
         x, y, z = marker.pose.position
-        place = 1e3 * np.linalg.norm(deviations[:3])
-        turn = np.degrees(np.linalg.norm(deviations[3:]))
-        name = marker.name.removeprefix("marker ")
-        mark = " poor" if poor else ""
+        place, turn = np.linalg.norm(deviations.reshape(2, 3), axis=1) * [1e3, np.degrees(1.0)]
+        name, mark = marker.name.removeprefix("marker "), " poor" if poor else ""
         print(f"{name:26} {sights:6} {x:9.4f} {y:9.4f} {z:9.4f} {place:8.2f} {turn:8.3f}{mark}")
-    _print_frame(found)
+    # In the frame of the origin, its own errors are in all other poses.
+    origin = found.markers[0]
+    turn = np.degrees(np.linalg.norm(found.deviations_of_shape[0, 3:]))
+    far = int(np.argmax([np.linalg.norm(marker.pose.position) for marker in found.markers]))
+    there = 1e3 * np.linalg.norm(found.deviations[far, :3])
+    print(
+        f"frame: that of {origin.name}, whose own orientation is known to {turn:.3f} deg: in it, "
+        f"{found.markers[far].name} is known to {there:.1f} mm"
+    )
     if found.poor.any():
         poor = tuple(found.markers[k] for k in np.flatnonzero(found.poor))
         print(f"warning: known to worse than a tenth of their size: {_listed(poor)}")
@@ -145,18 +146,6 @@ def _print_result(found: Survey, images: int) -> None:
             f"left out: {_listed(found.rare)}: too few images show them, or not enough to "
             "determine their orientation"
         )
-
-
-def _print_frame(found: Survey) -> None:
-    """Print the effect of the origin's own errors on all other poses in its frame."""
-    origin = found.markers[0]
-    turn = np.degrees(np.linalg.norm(found.deviations_of_shape[0, 3:]))
-    far = int(np.argmax([np.linalg.norm(marker.pose.position) for marker in found.markers]))
-    there = 1e3 * np.linalg.norm(found.deviations[far, :3])
-    print(
-        f"frame: that of {origin.name}, whose own orientation is known to {turn:.3f} deg: in it, "
-        f"{found.markers[far].name} is known to {there:.1f} mm"
-    )
 
 
 def _listed(markers: tuple[Marker, ...]) -> str:

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.tools.adjust.spline import Layout, Spline
+from rs_localizer.tools.adjust.spline import Spline
 from rs_localizer.tools.adjust.spline_kernels import CONTROL, LOCAL
 from rs_localizer.tools.adjust.system import Quadratic, Rows
 from rs_localizer.tools.adjust.variables import DELAY, MOUNT, Freedom, GyroSamples, Unknowns
@@ -70,17 +70,14 @@ class Floating:
         return Rows(values, np.zeros(1, np.int64), none, errors[None], float(errors @ errors))
 
 
-def _places(layout: Layout) -> tuple[IntArray, IntArray]:
-    """Return controls with an acceleration (k,), and 1 for the first one of a stretch, else 0."""
-    parts = [np.arange(first + 1, last - 1) for first, last in pairwise(layout.firsts.tolist())]
-    begins = np.concatenate([np.arange(len(part)) == 0 for part in parts]).astype(np.int64)
-    return np.concatenate(parts), begins
-
-
 def acceleration_rows(spline: Spline, expected: Freedom) -> Rows:
     """Return six rows for each control with an acceleration: rotations, then positions."""
     spacing, fading = spline.layout.spacing, expected.fading
-    at, begins = _places(spline.layout)
+    # Controls with an acceleration (k,), and 1 for the first one of a stretch, else 0.
+    ends = pairwise(spline.layout.firsts.tolist())
+    parts = [np.arange(first + 1, last - 1) for first, last in ends]
+    at = np.concatenate(parts)
+    begins = np.concatenate([np.arange(len(part)) == 0 for part in parts]).astype(np.int64)
     vectors, inverses = spline.steps()
     first = at - 2 + begins
     values, errors = np.zeros((len(at), 6, LOCAL)), np.zeros((len(at), 6))
@@ -96,12 +93,10 @@ def acceleration_rows(spline: Spline, expected: Freedom) -> Rows:
         errors[used, 3:] += scale * way
         by_turn = (before.swapaxes(1, 2), -before - after.swapaxes(1, 2), after)
         for place, by in enumerate(by_turn):
-            column = CONTROL * (k - 1 + place - first[used])
-            for i in range(3):
-                for j in range(3):
-                    values[own, i, column + j] += scale[:, 0] * by[:, i, j]
-            weight = scale * (-2.0 if place == 1 else 1.0)
-            values[own[:, None], 3 + axes, column[:, None] + 3 + axes] += weight
+            columns = (CONTROL * (k - 1 + place - first[used]))[:, None] + axes
+            turned = own[:, None, None], axes[:, None], columns[:, None]
+            values[turned] += scale[:, :, None] * by
+            values[own[:, None], 3 + axes, columns + 3] += scale * (-2.0 if place == 1 else 1.0)
     usual = spacing**2 * np.sqrt(1.0 - memory**2)
     sizes = np.array([expected.angular_acceleration, expected.linear_acceleration])
     weights = np.repeat(1.0 / sizes, 3) / usual[:, None]

@@ -33,12 +33,6 @@ class LensErrors(NamedTuple):
     distortion: float  # px at the corners, of what is none of the others
     aspect_ratio: float  # share, of fy over fx
 
-    def or_half(self, difference: LensErrors) -> LensErrors:
-        """Return the errors, enlarged by half the difference of two halves of a recording."""
-        return LensErrors(
-            *(float(np.hypot(a, 0.5 * b)) for a, b in zip(self, difference, strict=True))
-        )
-
 
 class Projected(NamedTuple):
     """Raw pixels of camera points and their derivatives."""
@@ -119,7 +113,9 @@ def lens_errors(camera: Camera, covariance: Array) -> LensErrors:
     """Return the errors of pixels by a covariance (m,m) of a camera's lens numbers."""
     rays, design = _field(camera)
     by_lens = project(camera, lens_values(camera), rays, True).by_lens
-    return _parts(design, (by_lens @ _root(covariance)).reshape(2 * len(rays), -1))
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return _parts(design, (by_lens @ root).reshape(2 * len(rays), -1))
 
 
 def lens_difference(camera: Camera, other: Camera) -> LensErrors:
@@ -154,15 +150,8 @@ def _parts(design: Array, moved: Array) -> LensErrors:
     numbers = np.linalg.lstsq(design, moved, rcond=None)[0]
     rest = (moved - design @ numbers)[:8]  # the corners
     size = np.sqrt(np.sum(numbers**2, axis=1))
-    return LensErrors(
-        float(np.hypot(size[0], size[1]) / np.sqrt(2.0)),
-        float(size[2]),
-        float(np.sqrt(np.sum(rest**2) / len(rest))),
-        float(size[3]),
+    centre, corners = (
+        np.hypot(size[0], size[1]) / np.sqrt(2.0),
+        np.sqrt(np.mean(np.sum(rest**2, 1))),
     )
-
-
-def _root(covariance: Array) -> Array:
-    """Return a matrix whose product with its transpose is the covariance."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+    return LensErrors(float(centre), float(size[2]), float(corners), float(size[3]))

@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.io.clouds import Correspondences
 from rs_localizer.localizer import Localizer
 from rs_localizer.tools.adjust.variables import SplineKeypoints
 
@@ -33,6 +35,9 @@ class ImagePoints:
     pixels: Array  # (n,2) raw
 
 
+Image = TypeVar("Image", ImagePoints, Correspondences)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Posed:
     """All keypoints of a recording, and a first pose of each image that has one."""
@@ -44,15 +49,16 @@ class Posed:
     positions: Array  # (f,3) m
 
 
-def in_order(images: Iterable[ImagePoints]) -> list[ImagePoints]:
+def in_order(images: Iterable[Image]) -> list[Image]:
     """Return images that show something by their stamps, one for each."""
     once = {image.stamp_ns: image for image in images if len(image.points)}
     return [once[stamp] for stamp in sorted(once)]
 
 
 def localize_each(
-    camera: Camera, images: list[ImagePoints], done: Callable[[], object] = lambda: None
-) -> list[Estimate | Failure]:
+    camera: Camera, images: Sequence[ImagePoints | Correspondences],
+    done: Callable[[], object] = lambda: None,
+) -> list[Estimate | Failure]:  # fmt: skip
     """Localize each image on its own: the readout time need not be known.
 
     Nor need the lens be right: where it is too wrong for a pose to be published, a rough one is a
@@ -84,27 +90,20 @@ def collect(
     times = np.array([(image.stamp_ns - start_ns) * 1e-9 for image in images]) + delay
     counts = [len(image.points) for image in images]
     pixels = np.concatenate([image.pixels for image in images])
-    landmarks, rows = np.unique(
-        np.concatenate([image.points for image in images]), axis=0, return_inverse=True
-    )
+    points = np.concatenate([image.points for image in images])
+    landmarks, rows = np.unique(points, axis=0, return_inverse=True)
     trusted = [
         result.inliers if result else np.zeros(count, dtype=np.bool_)
         for result, count in zip(results, counts, strict=True)
     ]
     posed = np.flatnonzero([bool(result) for result in results])
     estimates = [result for result in results if isinstance(result, Estimate)]
+    observations = SplineKeypoints(
+        camera, np.repeat(times, counts), camera.row_time(pixels), pixels, landmarks, rows.ravel(),
+        frames=np.repeat(np.arange(len(images)), counts), trusted=np.concatenate(trusted),
+    )  # fmt: skip
     return Posed(
-        SplineKeypoints(
-            times=np.repeat(times, counts),
-            row_times=camera.row_time(pixels),
-            pixels=pixels,
-            landmarks=landmarks,
-            points=rows.ravel(),
-            frames=np.repeat(np.arange(len(images)), counts),
-            trusted=np.concatenate(trusted),
-        ),
-        start_ns,
-        times[posed],
+        observations, start_ns, times[posed],
         np.array([estimate.rotation.T for estimate in estimates]).reshape(-1, 3, 3),
         np.array([estimate.position for estimate in estimates]).reshape(-1, 3),
-    )
+    )  # fmt: skip

@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.tools.adjust.bodies import Pieces, paper_covariance
 from rs_localizer.tools.adjust.factors import (
     Floating,
     Gyroscope,
@@ -25,7 +24,13 @@ from rs_localizer.tools.adjust.reprojection import LIMIT, Reprojection
 from rs_localizer.tools.adjust.row_kernels import EXTRINSICS, Curve, Projections
 from rs_localizer.tools.adjust.spline_kernels import CONTROL
 from rs_localizer.tools.adjust.system import Factored, Groups, Quadratic, Rows, System, Undetermined
-from rs_localizer.tools.adjust.variables import MOUNT, CameraView, Unknowns
+from rs_localizer.tools.adjust.variables import (
+    MOUNT,
+    CameraView,
+    Pieces,
+    Unknowns,
+    paper_covariance,
+)
 
 # Errors beyond this many standard deviations do not count for the scale of the noise.
 _SCALE_LIMIT = 4.0
@@ -66,7 +71,13 @@ class Problem:
         self._columns(start)
         pairs = list(zip(self.views, self.pieces, strict=True))
         self.keypoints = [Reprojection(*pair) for pair in pairs]
-        self._shapes = [_shape_information(*pair) for pair in pairs]
+        self._shapes: list[Array | None] = []  # information on the shapes of flat prints
+        for view, pieces in pairs:
+            shape = None
+            if view.freedom.paper and pieces.count and not pieces.rigid:
+                landmarks = view.observations.landmarks[pieces.slots >= 0]
+                shape = np.linalg.inv(paper_covariance(landmarks, view.freedom.landmarks))
+            self._shapes.append(None if shape is None else np.asarray(shape))
         self.floating = Floating(start.spline) if floating else None
         self._last: tuple[Unknowns, Curve, list[Unknowns]] | None = None
 
@@ -145,46 +156,39 @@ class Problem:
     def terms(self, state: Unknowns, deviation: float) -> list[Rows | Quadratic]:
         """Return all measurements and priors."""
         terms: list[Rows | Quadratic] = [*self.keypoint_rows(state, deviation)]
-        terms += self._expected_motion(state)
+        freedom, spline = self.freedom, state.spline
+        terms.append(acceleration_rows(spline, freedom))
+        if len(spline.layout.alone()) and freedom.angular_velocity < math.inf:
+            terms.append(rest_rows(spline, freedom.angular_velocity, freedom.linear_velocity))
         for k, own in enumerate(self.states(state)):
             terms += self._known(k, own)
         if self.deviations is not None:
             offsets = state.landmarks - self.views[0].observations.landmarks
             terms.append(block_rows(offsets, self.deviations, self.groups.kept))
         if self.floating is not None:
-            terms.append(self.floating.rows(state.spline))
+            terms.append(self.floating.rows(spline))
         if self.gyro is not None:
             terms += self.gyro.terms(state, self.at[0]["gyro"].start)
         return terms
-
-    def _expected_motion(self, state: Unknowns) -> list[Rows]:
-        freedom, spline = self.freedom, state.spline
-        rows = [acceleration_rows(spline, freedom)]
-        if len(spline.layout.alone()) and freedom.angular_velocity < math.inf:
-            rows.append(rest_rows(spline, freedom.angular_velocity, freedom.linear_velocity))
-        return rows
 
     def _known(self, k: int, own: Unknowns) -> list[Rows | Quadratic]:
         """Return the priors of a camera's unknowns."""
         terms: list[Rows | Quadratic] = []
         view, at, pieces = self.views[k], self.at[k], self.pieces[k]
-        freedom = view.freedom
         if "lens" in at:
             mean, information = self._lens_priors[k]
             terms.append(known(own.lens - mean, information, at["lens"].start))
         if "points" in at and self.deviations is None:
-            if pieces.rigid:  # a body none of whose landmarks fits stays where it is
-                information = np.full(pieces.columns, _LOOSE_BODY**-2)
-                offset = np.zeros(pieces.columns)
-            else:
-                free = pieces.slots >= 0
-                offset = (own.landmarks - view.observations.landmarks)[free].ravel()
-                information = np.full(pieces.columns, max(freedom.landmarks, 1e-12) ** -2)
+            offset = np.zeros(pieces.columns)
+            deviation = _LOOSE_BODY  # a body none of whose landmarks fits stays where it is
+            if not pieces.rigid:
+                offset = (own.landmarks - view.observations.landmarks)[pieces.slots >= 0].ravel()
+                deviation = max(view.freedom.landmarks, 1e-12)
             shape = self._shapes[k]
-            matrix = np.diag(information) if shape is None else shape
+            matrix = np.eye(pieces.columns) * deviation**-2 if shape is None else shape
             terms.append(known(offset, matrix, at["points"].start))
         if "delays" in at:
-            deviations = np.full(len(own.delays), freedom.stamps)
+            deviations = np.full(len(own.delays), view.freedom.stamps)
             terms.append(block_rows(own.delays[:, None], deviations, at["delays"].start))
         return terms
 
@@ -221,14 +225,10 @@ class Problem:
         """Return the noise deviation (px), from errors that count by the last one."""
         return max(noise_of(self.errors(state), deviation), self.freedom.least_noise)
 
-    def of_views(self, views: Sequence[CameraView], start: Unknowns) -> Problem:
-        """Return the problem with other views of the cameras."""
-        floating = self.floating is not None
-        return Problem(views, start, self.noises, self.deviations, floating)
-
     def trusted(self, start: Unknowns) -> Problem:
         """Return the problem with the trusted keypoints only."""
-        return self.of_views([view.subset(view.observations.trusted) for view in self.views], start)
+        views = [view.subset(view.observations.trusted) for view in self.views]
+        return Problem(views, start, self.noises, self.deviations, self.floating is not None)
 
     def images(self, inliers: BoolArray) -> int:
         """Count images of all cameras with some of these keypoints (n,)."""
@@ -297,11 +297,3 @@ def _pieces(view: CameraView, every: bool) -> Pieces:
         landmarks = np.unique(observations.points)
         slots[landmarks] = np.arange(len(landmarks))
     return Pieces(slots, rigid=False)
-
-
-def _shape_information(view: CameraView, pieces: Pieces) -> Array | None:
-    """Return the information on the shape of a flat print; None if it is none."""
-    if not (view.freedom.paper and pieces.count and not pieces.rigid):
-        return None
-    landmarks = view.observations.landmarks[pieces.slots >= 0]
-    return np.asarray(np.linalg.inv(paper_covariance(landmarks, view.freedom.landmarks)))

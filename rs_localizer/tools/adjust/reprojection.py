@@ -15,7 +15,6 @@ from collections.abc import Mapping
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.tools.adjust.bodies import Pieces
 from rs_localizer.tools.adjust.intrinsics import project
 from rs_localizer.tools.adjust.row_kernels import (
     Curve,
@@ -27,7 +26,7 @@ from rs_localizer.tools.adjust.row_kernels import (
 )
 from rs_localizer.tools.adjust.spline_kernels import CONTROL, LOCAL
 from rs_localizer.tools.adjust.system import Rows
-from rs_localizer.tools.adjust.variables import CameraView, Unknowns
+from rs_localizer.tools.adjust.variables import CameraView, Pieces, Unknowns
 
 LIMIT = 6.0
 """Tukey's limit in standard deviations: 97 % efficient on Gaussian noise in two dimensions."""

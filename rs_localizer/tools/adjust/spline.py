@@ -128,13 +128,11 @@ class Layout:
     @property
     def ends(self) -> Array:
         """Ends (s,) of the stretches, s."""
-        ends: Array = self.starts + self.spacing * (np.diff(self.firsts) - (ORDER - 1))
-        return ends
+        return np.asarray(self.starts + self.spacing * (np.diff(self.firsts) - (ORDER - 1)))
 
     def alone(self) -> IntArray:
         """Return the second controls (k,) of stretches of one interval, which lies behind them."""
-        seconds: IntArray = 1 + self.firsts[:-1][np.diff(self.firsts) == ORDER]
-        return seconds
+        return np.asarray(1 + self.firsts[:-1][np.diff(self.firsts) == ORDER])
 
     def control_times(self) -> Array:
         """Return the times (n,) at which the controls weigh most, s."""

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solve_triangular
 from scipy.linalg.blas import dtrmv
 from scipy.linalg.lapack import dpotri
-from scipy.sparse import bsr_array, csc_array, csr_array, vstack
+from scipy.sparse import bsr_array, csc_array, csr_array, dia_array, vstack
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
 from rs_localizer.core.arrays import Array, IntArray
@@ -51,12 +51,21 @@ class Rows(NamedTuple):
     errors: Array  # (n,r)
     cost: float  # sum of squares, or of what a robust loss makes of them
 
-    def matrix(self, part: slice, width: int) -> csr_array:
-        """Return a part of the derivatives (m r,width) by the first unknowns."""
-        some = self._replace(
-            values=self.values[part], first=self.first[part], others=self.others[part]
-        )
-        return _sparse(some, width)
+    @property
+    def run(self) -> int:
+        """How many neighbours a row touches."""
+        return int(self.values.shape[2] - self.others.shape[1])
+
+    def matrix(self, width: int, part: slice = slice(None)) -> csr_array:
+        """Return derivatives (m r,width) by the first unknowns, of all measurements or a part."""
+        others, values = self.others[part], self.values[part]
+        columns = np.concatenate([self.first[part, None] + np.arange(self.run), others], axis=1)
+        absent = (columns < 0) | (columns >= width)
+        values = np.where(absent[:, None], 0.0, values)
+        columns = np.where(absent, np.clip(columns[:, :1], 0, width - 1), columns)
+        columns = np.repeat(columns, values.shape[1], axis=0)
+        starts = columns.shape[1] * np.arange(len(columns) + 1)
+        return csr_array((values.ravel(), columns.ravel(), starts), shape=(len(columns), width))
 
 
 class Quadratic(NamedTuple):
@@ -116,15 +125,20 @@ class System:
         known = [term for term in terms if isinstance(term, Quadratic)]
         self.cost = sum(term.cost for term in terms)
         self.blocks = _eliminated(groups, rows) if groups.blocks else None
-        reach = max((_run(term) for term in rows), default=LOCAL)
-        if self.blocks is not None:
-            reach = max(reach, _reach(self.blocks, groups.motion))
+        reach = max((term.run for term in rows), default=LOCAL)
+        if self.blocks is not None:  # without the blocks, the motion has a band as wide as they
+            own = csc_array(self.blocks.coupled[: groups.motion])
+            own.sort_indices()
+            firsts, ends = own.indptr[:-1], own.indptr[1:]
+            some = ends > firsts
+            widths = own.indices[ends[some] - 1] - own.indices[firsts[some]]
+            reach = max(reach, int(np.max(widths, initial=0)) + 1)
         self.slope = np.zeros(groups.kept)
         self.matrix: Array | Band  # (N,N) of a dense motion
         if dense or reach > _DENSE * groups.motion:
             self.matrix = np.zeros((groups.kept, groups.kept))
             for term in rows:
-                own = _sparse(term, groups.kept)
+                own = term.matrix(groups.kept)
                 square = (own.T @ own).tocoo()
                 self.matrix[square.row, square.col] += square.data
                 self.slope += own.T @ term.errors.ravel()
@@ -155,26 +169,11 @@ class System:
         return self.matrix[self.groups.motion :, self.groups.motion :]
 
 
-def _run(rows: Rows) -> int:
-    return int(rows.values.shape[2] - rows.others.shape[1])
-
-
-def _sparse(rows: Rows, width: int) -> csr_array:
-    """Return derivatives (n r,width) by the first unknowns."""
-    columns = np.concatenate([rows.first[:, None] + np.arange(_run(rows)), rows.others], axis=1)
-    absent = (columns < 0) | (columns >= width)
-    values = np.where(absent[:, None], 0.0, rows.values)
-    columns = np.where(absent, np.clip(columns[:, :1], 0, width - 1), columns)
-    columns = np.repeat(columns, values.shape[1], axis=0)
-    starts = columns.shape[1] * np.arange(len(columns) + 1)
-    return csr_array((values.ravel(), columns.ravel(), starts), shape=(len(columns), width))
-
-
 def _eliminated(groups: Groups, rows: Sequence[Rows]) -> _Blocks:
     """Return the blocks of the rows that have one each, or none."""
     count, width, kept = groups.blocks, groups.width, groups.kept
     with_block = [term for term in rows if np.any(term.others >= kept)]
-    whole = vstack([_sparse(term, kept + count * width) for term in with_block]).tocsc()
+    whole = vstack([term.matrix(kept + count * width) for term in with_block]).tocsc()
     errors = np.concatenate([term.errors.ravel() for term in with_block])
     rest, own = whole[:, :kept], whole[:, kept:]
     information, square = np.zeros((count, width, width)), (own.T @ own).tocoo()
@@ -182,15 +181,6 @@ def _eliminated(groups: Groups, rows: Sequence[Rows]) -> _Blocks:
     coupled = csc_array(rest.T @ own)
     coupled.sort_indices()
     return _Blocks(information, np.asarray(own.T @ errors), coupled)
-
-
-def _reach(blocks: _Blocks, motion: int) -> int:
-    """Return the width of the band that the motion has without the blocks."""
-    own = csc_array(blocks.coupled[:motion])
-    own.sort_indices()
-    firsts, ends = own.indptr[:-1], own.indptr[1:]
-    some = ends > firsts
-    return int(np.max(own.indices[ends[some] - 1] - own.indices[firsts[some]], initial=0)) + 1
 
 
 class Factored:
@@ -213,13 +203,10 @@ class Factored:
                 own[:, np.arange(own.shape[1]), np.arange(own.shape[1])] *= 1.0 + damping
                 self._inverses = np.linalg.inv(own)
                 count = np.arange(len(own) + 1)
-                reduction = csr_array(
-                    blocks.coupled @ bsr_array((self._inverses, count[:-1], count))
-                )
+                inverse = bsr_array((self._inverses, count[:-1], count))
+                reduction = csr_array(blocks.coupled @ inverse)
             if isinstance(system.matrix, Band):
-                self._factor_band(
-                    Band(*(part.copy() for part in system.matrix)), damping, reduction
-                )
+                self._factor_band(Band(*map(np.copy, system.matrix)), damping, reduction)
             else:
                 self._factor_dense(system.matrix.copy(), damping, reduction)
         except (np.linalg.LinAlgError, ValueError) as error:
@@ -227,8 +214,7 @@ class Factored:
 
     def _factor_dense(self, matrix: Array, damping: float, reduction: csr_array | None) -> None:
         matrix[np.diag_indices(len(matrix))] *= 1.0 + damping
-        if reduction is not None:
-            assert self.system.blocks is not None
+        if reduction is not None and self.system.blocks is not None:
             others = self.system.blocks.coupled.T
             for first in range(0, len(matrix), _ROWS_AT_ONCE):
                 some = slice(first, first + _ROWS_AT_ONCE)
@@ -239,8 +225,7 @@ class Factored:
         band.own[:, 0] *= 1.0 + damping
         band.corner[np.diag_indices(len(band.corner))] *= 1.0 + damping
         scale = 1.0 / np.sqrt(np.maximum(np.diag(band.corner), 1e-300))
-        if reduction is not None:
-            assert self.system.blocks is not None
+        if reduction is not None and self.system.blocks is not None:
             motion, coupled = len(band.own), self.system.blocks.coupled
             shared = coupled[motion:].toarray().T
             band.corner[:] -= reduction[motion:] @ shared
@@ -345,9 +330,7 @@ class Factored:
         start = np.random.default_rng(0).normal(size=size)  # the same images, the same map
         try:
             _, modes = eigsh(
-                matrix,
-                min(count, size - 1),
-                LinearOperator((size, size), reduced, dtype=float),
+                matrix, min(count, size - 1), LinearOperator((size, size), reduced, dtype=float),
                 Minv=LinearOperator((size, size), solve, dtype=float),
                 which="LA", v0=start, tol=_MODE_TOLERANCE,
             )  # fmt: skip
@@ -361,7 +344,7 @@ class Factored:
         From the blocks on and beside the diagonal of the inverse of the band (a recursion from
         its end to its beginning), and from the border's covariance.
         """
-        count = self.system.groups.motion
+        count, starts = self.system.groups.motion, (CONTROL * firsts).tolist()
         if not isinstance(self.system.matrix, Band):
             inverse = self.kept(np.eye(self.system.groups.kept))
             at = CONTROL * firsts[:, None] + np.arange(LOCAL)
@@ -370,36 +353,33 @@ class Factored:
         diagonal, beside = self._inverse_blocks(size)
         border = self.border_covariance()
         out, pair = np.empty((len(firsts), LOCAL, LOCAL)), np.empty((2 * size, 2 * size))
-        for m, first in enumerate(firsts):
-            block, inside = divmod(CONTROL * int(first), size)
+        for m, start in enumerate(starts):
+            block, inside = divmod(start, size)
             following = min(block + 1, len(diagonal) - 1)
             pair[:size, :size], pair[size:, size:] = diagonal[block], diagonal[following]
             pair[:size, size:], pair[size:, :size] = beside[block], beside[block].T
-            begin = CONTROL * int(first)
-            lifted = self._lifted[begin : min(begin + LOCAL, count)]
-            own = pair[inside : inside + LOCAL, inside : inside + LOCAL]
-            out[m] = own + lifted @ border @ lifted.T
+            lifted = self._lifted[start : min(start + LOCAL, count)]
+            own = slice(inside, inside + LOCAL)
+            out[m] = pair[own, own] + lifted @ border @ lifted.T
         return out
 
     def _inverse_blocks(self, size: int) -> tuple[Array, Array]:
         """Return the blocks (k,s,s) on the diagonal of H^-1, and those to their right."""
-        band, count = self._band, self.system.groups.motion
+        count = self.system.groups.motion
         blocks = -(-count // size)
-        lower, below = np.zeros((2, blocks, size, size))  # and L of the next block by this one
-        lower[:] = np.eye(size)
-        for d in range(min(len(band), count)):
-            columns = np.arange(count - d)
-            rows = columns + d
-            where, value = (columns // size, rows % size, columns % size), band[d, : count - d]
-            for ahead, blocks_of in ((0, lower), (1, below)):
-                here = rows // size == columns // size + ahead
-                blocks_of[tuple(w[here] for w in where)] = value[here]
-        diagonal, beside = np.empty_like(lower), np.zeros_like(lower)
+        band = np.zeros((len(self._band), blocks * size))  # of whole blocks
+        band[0], band[:, :count] = 1.0, self._band
+        lower = dia_array((band, -np.arange(len(band))), shape=(blocks * size,) * 2).tocsr()
+        diagonal, beside = np.zeros((2, blocks, size, size))
         for k in range(blocks - 1, -1, -1):
-            inverse = solve_triangular(lower[k], np.eye(size), lower=True, check_finite=False)
+            own, following = (slice(i * size, (i + 1) * size) for i in (k, k + 1))
+            inverse = solve_triangular(
+                lower[own, own].toarray(), np.eye(size), lower=True, check_finite=False
+            )
             diagonal[k] = inverse.T @ inverse
             if k + 1 < blocks:
-                gain = below[k] @ inverse  # (next, this): x_this = ... - gain^T x_next
+                # (next, this): x_this = ... - gain^T x_next
+                gain = lower[following, own].toarray() @ inverse
                 beside[k] = -gain.T @ diagonal[k + 1]
-                diagonal[k] = diagonal[k] - beside[k] @ gain
+                diagonal[k] -= beside[k] @ gain
         return diagonal, beside

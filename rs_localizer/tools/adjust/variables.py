@@ -1,6 +1,9 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements, free unknowns, and their steps."""
+"""Measurements, free unknowns, and their steps.
+
+Landmarks move together: each free one by itself, or the corners of one rigid marker.
+"""
 
 from __future__ import annotations
 
@@ -57,8 +60,7 @@ class GyroMount:
         """(3,3), from the camera's rates to measured ones without bias."""
         xx, yy, zz, yz, xz, xy = self.shape
         symmetric = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        matrix: Array = (np.eye(3) + symmetric) @ self.camera_from_imu.T
-        return matrix
+        return np.asarray((np.eye(3) + symmetric) @ self.camera_from_imu.T)
 
     def moved(self, step: Array) -> GyroMount:
         """Return the mount after a step (13,)."""
@@ -70,8 +72,7 @@ class GyroMount:
     def beside(self, first: GyroMount) -> Array:
         """Return the step (13,) that leads here from a first guess, which has no shape."""
         turn = so3.log(np.ascontiguousarray(first.camera_from_imu.T @ self.camera_from_imu))
-        step: Array = np.r_[turn, self.bias - first.bias, self.delay - first.delay, self.shape]
-        return step
+        return np.asarray(np.r_[turn, self.bias - first.bias, self.delay - first.delay, self.shape])
 
     def turned_from(self, given: Array) -> float:
         """Return the angle (rad) between its rotation and a given one (3,3)."""
@@ -81,8 +82,9 @@ class GyroMount:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SplineKeypoints:
-    """Keypoints of all frames."""
+    """Keypoints of all frames of one camera."""
 
+    camera: Camera  # its lens, size and scan
     times: Array  # (n,) s, when the middle row of their frame was exposed, readout time aside
     row_times: Array  # (n,) -0.5 at the first exposed row, 0.5 at the last
     pixels: Array  # (n,2) raw
@@ -121,8 +123,7 @@ class Extrinsics:
     def beside(self, other: Extrinsics) -> Array:
         """Return the step (7,) that leads here from others."""
         turn = so3.log(np.ascontiguousarray(self.axes @ other.axes.T))
-        step: Array = np.r_[turn, self.centre - other.centre, self.offset - other.offset]
-        return step
+        return np.asarray(np.r_[turn, self.centre - other.centre, self.offset - other.offset])
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,9 +156,12 @@ class Freedom:
 class CameraView:
     """Keypoints of one camera, and what of it is free."""
 
-    camera: Camera
     observations: SplineKeypoints
     freedom: Freedom
+
+    @property
+    def camera(self) -> Camera:
+        return self.observations.camera
 
     def subset(self, chosen: BoolArray) -> CameraView:
         """Return the view with the chosen keypoints (n,)."""
@@ -180,22 +184,101 @@ class Unknowns:
     others: tuple[Unknowns, ...] = ()
 
 
-def start_state(
-    camera: Camera, observations: SplineKeypoints, spline: Spline, readout_time: float = 0.0
-) -> Unknowns:
+def start_state(seen: SplineKeypoints, spline: Spline, readout_time: float) -> Unknowns:
     """Return a first guess with the camera's own lens and the map as it is given."""
-    delays = np.zeros(int(observations.frames.max(initial=-1)) + 1)
-    return Unknowns(
-        spline, readout_time, lens_values(camera), observations.landmarks.copy(), delays
-    )
+    delays = np.zeros(int(seen.frames.max(initial=-1)) + 1)
+    return Unknowns(spline, readout_time, lens_values(seen.camera), seen.landmarks.copy(), delays)
 
 
-def rig_state(
-    spline: Spline, cameras: Iterable[tuple[Camera, SplineKeypoints, Extrinsics]]
-) -> Unknowns:
+def rig_state(spline: Spline, cameras: Iterable[tuple[SplineKeypoints, Extrinsics]]) -> Unknowns:
     """Return a first guess of cameras on one body, with their own readout times and clocks."""
     first, *others = (
-        replace(start_state(camera, seen, spline, camera.readout_time), extrinsics=mounted)
-        for camera, seen, mounted in cameras
+        replace(start_state(seen, spline, seen.camera.readout_time), extrinsics=mounted)
+        for seen, mounted in cameras
     )
     return replace(first, others=tuple(others))
+
+
+PLACE, BODY = 3, 6
+"""Numbers of a free point, and of a body: its place, then its turn in the map's axes."""
+
+_FLAT = 1e-6  # thickness of a plane by its size: rounding of single precision
+# Standard deviations by half the size of a print. Paper curls by one part in a hundred (2 mm of an
+# A4 sheet), in waves that are smaller the shorter they are; printers and screens stretch one
+# direction by up to three parts in a thousand more than the other.
+_BENDS = {2: 1e-2, 3: 5e-3, 4: 2.5e-3}  # by the degree of the polynomial
+_STRETCH = 3e-3
+
+
+def is_flat(points: Array) -> bool:
+    """Return True if points (p,3) lie in one plane."""
+    sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(sizes[2] < _FLAT * sizes[0])
+
+
+def paper_covariance(points: Array, deviation: float) -> Array:
+    """Return the covariance (3 p, 3 p) of the errors of points (p,3) on a flat print.
+
+    Out of the plane low polynomials, which neither turn nor shift it, in the plane stretch and
+    shear; and of each point by itself its ``deviation`` (m).
+    """
+    middle = points.mean(axis=0)
+    axes = np.linalg.svd(points - middle)[2]
+    flat = (points - middle) @ axes[:2].T
+    half = 0.5 * float(np.ptp(flat, axis=0).max())
+    x, y = (flat / half).T
+    plane = np.column_stack([np.ones_like(x), x, y])
+    modes = [
+        _STRETCH * (np.outer(along, axes[0]) + np.outer(across, axes[1]))
+        for along, across in ((x, -y), (y, x))
+    ]
+    for degree, size in _BENDS.items():
+        for power in range(degree + 1):
+            bend = x ** (degree - power) * y**power
+            bend = bend - plane @ np.linalg.lstsq(plane, bend, rcond=None)[0]
+            modes.append(size * np.outer(bend, axes[2]))
+    root = half * np.reshape(modes, (len(modes), -1))
+    return np.asarray(root.T @ root + deviation**2 * np.eye(root.shape[1]))
+
+
+class Pieces:
+    """The free parts of a map.
+
+    Args:
+        slots: (p,) number of the part that each landmark belongs to, from 0 on; -1: known.
+        rigid: whether parts are bodies that turn, or single points.
+    """
+
+    def __init__(self, slots: IntArray, rigid: bool) -> None:
+        self.slots, self.rigid, self.width = slots, rigid, BODY if rigid else PLACE
+        self.count = int(slots.max(initial=-1)) + 1
+
+    @property
+    def columns(self) -> int:
+        """How many numbers are free."""
+        return self.width * self.count
+
+    def centres(self, landmarks: Array) -> Array:
+        """Return the middles (c,3) of the parts of landmarks (p,3)."""
+        free = self.slots >= 0
+        members = np.bincount(self.slots[free], minlength=self.count)
+        sums = [np.bincount(self.slots[free], of, self.count) for of in landmarks[free].T]
+        return np.column_stack(sums) / members[:, None]
+
+    def arms(self, landmarks: Array) -> Array:
+        """Return vectors (p,3) from the middle of its part to each landmark; zeros where known."""
+        arms = np.zeros_like(landmarks)
+        if self.rigid:
+            free = self.slots >= 0
+            arms[free] = landmarks[free] - self.centres(landmarks)[self.slots[free]]
+        return arms
+
+    def moved(self, landmarks: Array, step: Array) -> Array:
+        """Return the landmarks (p,3) after a step (columns,)."""
+        step, free = step.reshape(-1, self.width), self.slots >= 0
+        moved, own = landmarks.copy(), self.slots[free]
+        moved[free] += step[own, :PLACE]
+        if self.rigid:
+            turns, arms = so3.exp_many(step[:, PLACE:]), self.arms(landmarks)[free]
+            moved[free] += np.einsum("nij,nj->ni", turns[own], arms) - arms
+        return moved

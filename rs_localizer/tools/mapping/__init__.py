@@ -1,7 +1,3 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
 """Maps from images: landmarks and markers refined together with the motion that saw them."""
-
-
-class MappingError(ValueError):
-    """Images that make no map; the message says why and what would help."""

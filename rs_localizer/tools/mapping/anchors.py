@@ -16,10 +16,9 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.tools.mapping import MappingError
 from rs_localizer.tools.mapping.gauge import Similarity, through, upright
 from rs_localizer.tools.mapping.map_keypoints import MapObservations, Start
-from rs_localizer.tools.mapping.seen_images import SeenImage
+from rs_localizer.tools.mapping.structure import SeenImage
 from rs_localizer.tools.mapping.triangulation import Sights, Triangulated, triangulate
 
 # Corners of markers are where their map says to this part of their extent, or one of both is wrong.
@@ -107,23 +106,29 @@ def placement(
         rotations, positions: (g,3,3), (g,3) map_from_camera of all views, as they were held.
 
     Raises:
-        MappingError: if the anchors contradict each other or were not seen.
+        ValueError: if the anchors contradict each other or were not seen.
     """
     if anchors.marker_map is not None:
         return _by_markers(anchors.marker_map, triangulated)
-    turn = upright(_down(rotations))
+    # The direction most often at right angles to image rows, as cameras are held level; its sign is
+    # that of the mean downward direction of the images.
+    across = rotations[:, :, 0]
+    axis, down = np.linalg.eigh(across.T @ across)[1][:, 0], rotations[:, :, 1].mean(axis=0)
+    turn = upright(axis if axis @ down >= 0.0 else -axis)
     if not anchors.distances:
         return Placement(
             Similarity(1.0, turn, -turn @ positions[0]), False, "the scale is undetermined"
         )
-    factors = []
+    names, factors = anchors.names, []
     for distance in anchors.distances:
-        one, other = (
-            triangulated.points[_row(anchors, name)] for name in (distance.one, distance.other)
-        )
+        ends = distance.one, distance.other
+        if unknown := [name for name in ends if name not in names]:
+            raise ValueError(f"unknown point {unknown[0]}; points are {', '.join(names) or 'none'}")
+        rows = [anchors.corners + names.index(name) for name in ends]
+        one, other = triangulated.points[rows]
         apart = float(np.linalg.norm(one - other))
         if not apart > 0.0:  # NaN: one of them is seen by one image only, or far away
-            raise MappingError(
+            raise ValueError(
                 f"the distance {distance.one} {distance.other} gives no scale: each point must be "
                 "given in two images or more that see it from different places"
             )
@@ -131,7 +136,7 @@ def placement(
     scale = float(np.median(factors))
     spread = max(factors) / min(factors) - 1.0
     if spread > _MOST_CONTRADICTION:
-        raise MappingError(
+        raise ValueError(
             f"the distances contradict each other by {100 * spread:.1f} %: check the points' "
             "pixels and the metres"
         )
@@ -141,18 +146,11 @@ def placement(
     )  # fmt: skip
 
 
-def _row(anchors: Anchors, name: str) -> int:
-    if name not in anchors.names:
-        raise MappingError(f"unknown point {name}; points are {', '.join(anchors.names) or 'none'}")
-    return anchors.corners + anchors.names.index(name)
-
-
 def determined_corners(marker_map: MarkerMap, triangulated: Triangulated) -> BoolArray:
     """Return a mask (c,) of the map's corners that three images or more see."""
     count = len(marker_map.points)
     places, counts = triangulated.points[:count], triangulated.counts[:count]
-    determined: BoolArray = np.isfinite(places).all(axis=1) & (counts > 2)
-    return determined
+    return np.asarray(np.isfinite(places).all(axis=1) & (counts > 2))
 
 
 def _by_markers(marker_map: MarkerMap, triangulated: Triangulated) -> Placement:
@@ -160,7 +158,7 @@ def _by_markers(marker_map: MarkerMap, triangulated: Triangulated) -> Placement:
     places = triangulated.points[: len(truth)]
     determined = determined_corners(marker_map, triangulated)
     if np.count_nonzero(determined) < _LEAST_CORNERS:
-        raise MappingError(
+        raise ValueError(
             f"{np.count_nonzero(determined)} corners of the marker map are seen by three images or "
             f"more, {_LEAST_CORNERS} are needed: show the markers from several places"
         )
@@ -171,32 +169,19 @@ def _by_markers(marker_map: MarkerMap, triangulated: Triangulated) -> Placement:
     extent = float(np.linalg.norm(np.ptp(truth[determined], axis=0)))
     misfit = float(np.sqrt(np.average(errors**2, weights=spread**-2.0)))
     if misfit > _MOST_MISFIT * extent:
-        raise MappingError(
+        raise ValueError(
             f"the markers do not lie where their map says: corners are off by {1e3 * misfit:.0f} "
             f"mm (rms) over {extent:.2f} m; check sizes and places in the marker map"
         )
-    corners = int(np.count_nonzero(determined))
-    basis = f"{corners} corners of markers, within {1e3 * misfit:.1f} mm (rms) of their map"
-    metres, part = _USUAL_MISFIT
-    doubt = ""
+    count, off = np.count_nonzero(determined), f"{1e3 * misfit:.1f} mm (rms)"
+    basis = f"{count} corners of markers, within {off} of their map"
+    (metres, part), doubt = _USUAL_MISFIT, ""
     if misfit > max(metres, part * extent):
         doubt = (
             f"the markers' corners are {1e3 * misfit:.1f} mm (rms) off their map, and so may be "
             "the landmarks: check sizes and places in the marker map, and the readout time"
         )
     return Placement(similarity, True, basis, doubt, "as in the marker map")
-
-
-def _down(rotations: Array) -> Array:
-    """Return the direction most often at right angles to image rows: cameras are held level.
-
-    Its sign is given by the mean downward direction of the images.
-    """
-    across = rotations[:, :, 0]
-    _, vectors = np.linalg.eigh(across.T @ across)
-    down = rotations[:, :, 1].mean(axis=0)
-    axis: Array = vectors[:, 0]
-    return axis if axis @ down >= 0.0 else -axis
 
 
 # Observations that determine a corner.

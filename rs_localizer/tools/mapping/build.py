@@ -31,7 +31,6 @@ from rs_localizer.io.recording import CAMERA_FRAME, MAP_FRAME, make_camera_info
 from rs_localizer.offline.replay import inlier_columns
 from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.keypoints import Extracted, keypoints
-from rs_localizer.tools.mapping import MappingError
 from rs_localizer.tools.mapping.anchors import (
     Anchors,
     Placement,
@@ -49,13 +48,15 @@ from rs_localizer.tools.mapping.refinement import (
     likely_axis,
     refine_with_shutter,
 )
-from rs_localizer.tools.mapping.seen_images import (
+from rs_localizer.tools.mapping.structure import (
     LEAST_VIEWS,
     SeenImage,
+    Stage,
+    Structure,
+    build_structure,
     check_views,
     choose_keyframes,
 )
-from rs_localizer.tools.mapping.structure import Stage, Structure, build_structure
 from rs_localizer.tools.mapping.triangulation import Sights, Triangulated, moves, triangulate
 from rs_localizer.tools.readout_belief import ReadoutCheck, ShutterFit
 
@@ -64,11 +65,9 @@ _THRESHOLD = 4.0
 
 
 def track_on_map(
-    views: Sequence[SeenImage],
-    structure: Structure,
-    camera: Camera,
+    views: Sequence[SeenImage], structure: Structure, camera: Camera,
     done: Callable[[], object] = lambda: None,
-) -> tuple[IntArray, MapObservations, Start]:
+) -> tuple[IntArray, MapObservations, Start]:  # fmt: skip
     """Return rows (k,) of the views with a pose, and what they show.
 
     Keyframes are where COLMAP has them, the others are localized.
@@ -150,10 +149,6 @@ class Given:
     readout_time: float | None = None  # s, 0: a global shutter; None: estimated
     scan_direction: str | None = None  # None: unknown
     frame: str = "map"
-
-    @property
-    def stamps_ns(self) -> IntArray:
-        return np.array([view.stamp_ns for view in self.views], np.int64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -253,8 +248,16 @@ def built_from(
     rows, shown, start = tracked
     used, adjusted, near = adjusted_part(shown, start, ADJUSTED)
     refined, shutter, check = _refined(inputs, adjusted, near, camera, stage)
-    estimated = None if inputs.camera is not None else structure.camera.focal_length
-    check_fit(refined.fit_share, estimated)
+    if refined.fit_share < LEAST_FIT:  # the motion is open, and the map may follow it
+        lens = "" if inputs.camera is not None else (
+            f"; COLMAP found a focal length of {structure.camera.focal_length:.0f} px, which a "
+            "flat scene does not determine: give --calibration, or show more depth"
+        )  # fmt: skip
+        raise ValueError(
+            f"after the refinement {100 * refined.fit_share:.0f} % of the keypoints fit the map, "
+            f"{100 * LEAST_FIT:.0f} % should: use more images per second, film more slowly, or "
+            f"check the readout time and the calibration{lens}"
+        )
     motion = ViewMotion(rows[used], refined.times, refined)
     seen = rows[shown.images], shown.landmarks, shown.pixels
     triangulated = triangulate(refined.camera, motion.sights(*seen), len(structure.start.points))
@@ -270,21 +273,19 @@ def built_from(
         holding, by = held.chosen(corners), motion.moves(anchors, held)[corners]
     modes = laid_on_held(triangulated.points[kept], modes, holding, by)
     rotations, positions = motion.refined.poses()
+    known, turn = triangulated.chosen(kept), similarity.scale * similarity.rotation
+    landmarks = Map(
+        similarity(known.points), np.arange(len(kept)),
+        np.ascontiguousarray(structure.descriptors[kept]), inputs.frame,
+        covariances=turn @ known.covariances @ turn.T,
+        error_modes=np.asarray(turn @ modes, np.float32),
+    )  # fmt: skip
     return Built(
-        landmarks=_landmarks(
-            triangulated.chosen(kept), modes, structure.descriptors[kept], similarity, inputs.frame
-        ),
-        camera=refined.camera_as_found,
-        placement=place,
+        landmarks=landmarks, camera=refined.camera_as_found, placement=place,
         keyframes=structure.views,
-        structure=replace(structure, start=structure.start.moved(similarity)),
-        kept=kept,
-        shutter=shutter,
-        readout_check=check,
-        refined=refined,
-        posed=motion.rows,
-        rotations=similarity.rotation @ rotations,
-        positions=similarity(positions),
+        structure=replace(structure, start=structure.start.moved(similarity)), kept=kept,
+        shutter=shutter, readout_check=check, refined=refined, posed=motion.rows,
+        rotations=similarity.rotation @ rotations, positions=similarity(positions),
     )  # fmt: skip
 
 
@@ -295,7 +296,7 @@ def _structure(inputs: Given, keyframes: IntArray, folder: Path, stage: Stage) -
     total = len(keyframes)
     if structure.parts[0] < max(LEAST_VIEWS, _LEAST_PART * total):
         listed = " and ".join(map(str, structure.parts))
-        raise MappingError(
+        raise ValueError(
             f"reconstruction is disconnected (components of {listed} keyframes, of {total}): "
             "record what lies between them, slowly, without blank walls"
         )
@@ -314,47 +315,20 @@ def _refined(
     """Return the refined map, a shutter that was unknown or wrong, the check of a given one."""
     freedom = replace(colmap_freedom(inputs.camera is None), drifts=_MODES)
     if inputs.anchors.marker_map is not None:
-        corners = _corners(inputs, observations.stamps_ns)
+        stamps_ns = observations.stamps_ns
+        views, corners, pixels = inputs.anchors.seen(inputs.views)
+        stamps = np.array([view.stamp_ns for view in inputs.views], np.int64)[views]
+        images = np.minimum(np.searchsorted(stamps_ns, stamps), len(stamps_ns) - 1)
+        known = stamps_ns[images] == stamps
+        shown = MapObservations(stamps_ns, images[known], corners[known], pixels[known])
         places = inputs.anchors.marker_map.points
         observations, start, deviations = marker_constraints(
-            camera, observations, start, corners, places
+            camera, observations, start, shown, places
         )
         freedom = replace(freedom, deviations=deviations)
     given = inputs.readout_time
     with stage("refine", 3 if given is not None else 6) as step:
         return refine_with_shutter(camera, observations, start, freedom, given, lambda _: step(1))
-
-
-def _corners(inputs: Given, stamps_ns: IntArray) -> MapObservations:
-    """Return corners of markers in the images with these stamps."""
-    views, corners, pixels = inputs.anchors.seen(inputs.views)
-    stamps = inputs.stamps_ns[views]
-    images = np.minimum(np.searchsorted(stamps_ns, stamps), len(stamps_ns) - 1)
-    known = stamps_ns[images] == stamps
-    return MapObservations(stamps_ns, images[known], corners[known], pixels[known])
-
-
-def check_fit(share: float, focal_length: float | None) -> None:
-    """Refuse images too far apart: they leave the motion open, and the map may follow it.
-
-    Args:
-        share: of the keypoints that fit.
-        focal_length: px, that COLMAP found; None: it was given.
-
-    Raises:
-        MappingError: saying what to do.
-    """
-    if share >= LEAST_FIT:
-        return
-    lens = "" if focal_length is None else (
-        f"; COLMAP found a focal length of {focal_length:.0f} px, which a flat scene does not "
-        "determine: give --calibration, or show more depth"
-    )  # fmt: skip
-    raise MappingError(
-        f"after the refinement {100 * share:.0f} % of the keypoints fit the map, "
-        f"{100 * LEAST_FIT:.0f} % should: use more images per second, film more slowly, or "
-        f"check the readout time and the calibration{lens}"
-    )
 
 
 def _kept(triangulated: Triangulated, motion: ViewMotion) -> IntArray:
@@ -364,21 +338,94 @@ def _kept(triangulated: Triangulated, motion: ViewMotion) -> IntArray:
     good = triangulated.counts >= _LEAST_SIGHTS
     good &= triangulated.spread < _MOST_DEVIATION * np.nanmedian(away)
     if not good.any():
-        raise MappingError(
+        raise ValueError(
             f"none of {len(good)} landmarks is seen by {_LEAST_SIGHTS} images that determine it"
         )
     return np.flatnonzero(good)
 
 
-def _landmarks(
-    known: Triangulated, modes: Array, descriptors: np.ndarray, to_map: Similarity, frame: str
-) -> Map:
-    turn = to_map.scale * to_map.rotation
-    return Map(
-        to_map(known.points),
-        np.arange(len(known.points)),
-        np.ascontiguousarray(descriptors),
-        frame,
-        covariances=turn @ known.covariances @ turn.T,
-        error_modes=np.asarray(turn @ modes, np.float32),
-    )
+# Advice is given where more than this share of the images is blurred or has no pose.
+_MANY = 0.1
+# A walk comes back if this share of what its last images show was shown by its first ones, a tenth
+# of all each. What lies between holds together by neighbours alone, whose errors add up.
+_AGAIN, _ENDS = 0.1, 0.1
+
+
+def result_rows(built: Built, images: int, views: int) -> dict[str, str]:
+    """Return the table of results; of so many images so many ``views`` were looked at."""
+    refined, landmarks = built.refined, built.landmarks
+    assert landmarks.covariances is not None
+    spread = np.sqrt(np.trace(landmarks.covariances, axis1=1, axis2=2))
+    unit = "mm" if built.placement.scaled else "units of the map / 1000"
+    return {
+        "images": f"{images}, {views} used, {len(built.posed)} with a pose",
+        "landmarks": f"{len(landmarks)} of {len(built.structure.start.points)} points",
+        "deviation of a landmark": f"{1e3 * np.median(spread):.1f} {unit} (median)",
+        "deviation that landmarks share": f"{_shared(built):.1f} {unit} (median)",
+        "noise": f"{refined.before:.2f} px, after the refinement {refined.after:.2f} px",
+        "readout time": _shutter(built),
+        "scale": built.placement.basis,
+        "z is up": built.placement.up,
+    }
+
+
+def _shared(built: Built) -> float:
+    """Return the median deviation that a landmark shares with others, in 1/1000 of the map."""
+    assert built.landmarks.error_modes is not None
+    return 1e3 * float(np.median(np.linalg.norm(built.landmarks.error_modes, axis=(1, 2))))
+
+
+def filming_advice(built: Built, views: Sequence[SeenImage]) -> list[str]:
+    """Return sentences on how to film a better map."""
+    said = []
+    lost = np.ones(len(views), np.bool_)
+    lost[built.posed] = False
+    if np.mean(lost) > _MANY:
+        rows_lost = np.flatnonzero(lost)[[0, -1]].tolist()
+        begin, last = (1e-9 * (views[k].stamp_ns - views[0].stamp_ns) for k in rows_lost)
+        said.append(
+            f"{np.mean(lost):.0%} of the images, from {begin:.1f} to {last:.1f} s, have no pose: "
+            "film there more slowly"
+        )
+    if len(built.structure.parts) > 1:
+        said.append(
+            f"{sum(built.structure.parts[1:])} keyframes are not connected with the others: film "
+            "what lies between, and come back to where you began"
+        )
+    if not comes_back(built.structure.seen):
+        unit = "mm" if built.placement.scaled else "thousandths of the map's unit"
+        said.append(
+            f"the last images show nothing that the first ones do: landmarks share errors of "
+            f"{_shared(built):.1f} {unit}, larger ones towards the ends; come back to where you "
+            "began, or show markers at both ends"
+        )
+    shutter = built.shutter
+    known = shutter.visible if shutter else not built.refined.apart
+    if not known:
+        said.append(
+            "for the readout time, film at the camera's own rate (no time lapse, no stabilization) "
+            "and rotate the camera quickly, sideways and up and down, for some seconds"
+        )
+    return said
+
+
+def comes_back(seen: MapObservations) -> bool:
+    """Return whether the last images show landmarks that the first ones show."""
+    count = len(seen.stamps_ns)
+    ends = max(1, round(_ENDS * count))
+    first = np.unique(seen.landmarks[seen.images < ends])
+    last = np.unique(seen.landmarks[seen.images >= count - ends])
+    return len(np.intersect1d(first, last)) >= _AGAIN * min(len(first), len(last))
+
+
+def _shutter(built: Built) -> str:
+    fit, known = built.shutter, built.camera.readout_time
+    if fit is None:
+        if built.refined.apart:
+            return "invisible: no smooth motion joins the images, each has a pose of its own"
+        return f"{1e3 * known:.2f} ms (given)" if known else "unknown, or none"
+    best = f"{1e3 * fit.readout_time:.2f} +- {1e3 * fit.deviation:.2f} ms, {fit.direction}"
+    if fit.visible:
+        return f"{best} (estimated)"
+    why = "" if fit.possible else f", longer than {1e3 * fit.interval:.1f} ms between images"
+    return f"invisible in these images (best fit {best}{why})"

@@ -20,7 +20,6 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.rectification import transferred
 from rs_localizer.io.maps.colmap import Model, ModelImage, Points
 from rs_localizer.tools.adjust.reprojection import LIMIT
-from rs_localizer.tools.mapping import MappingError
 from rs_localizer.tools.mapping.build import ViewMotion, usual_size
 from rs_localizer.tools.mapping.map_keypoints import ADJUSTED, LEAST_KEYPOINTS, adjusted_part
 from rs_localizer.tools.mapping.refinement import (
@@ -51,13 +50,10 @@ class GlobalShutterModel:
 
 
 def undo_shutter(
-    camera: Camera,
-    model: Model,
-    stamps_ns: Mapping[str, int],
-    shutter: tuple[float | None, str | None],
-    lens: bool,
+    camera: Camera, model: Model, stamps_ns: Mapping[str, int],
+    shutter: tuple[float | None, str | None], lens: bool,
     done: Callable[[str], object] = lambda text: None,
-) -> GlobalShutterModel:
+) -> GlobalShutterModel:  # fmt: skip
     """Return the model that a global shutter would have given.
 
     Args:
@@ -78,7 +74,7 @@ def undo_shutter(
     start, scale = given.moved(size), size.scale
     used, some, near = adjusted_part(seen, start, ADJUSTED, LEAST_KEYPOINTS)
     if not len(used):
-        raise MappingError(
+        raise ValueError(
             f"no image of the model shows {LEAST_KEYPOINTS} points that three images see"
         )
     camera = replace(camera, scan_direction=likely_axis(camera.size, shutter[1]))
@@ -90,19 +86,15 @@ def undo_shutter(
     posed = np.isin(seen.images, used)
     at, rows, pixels = seen.images[posed], seen.landmarks[posed], seen.pixels[posed]
     points = triangulate(refined.camera, projected, len(start.points)).points
-    rotations = np.swapaxes(projected.rotations, 1, 2)
-    own = rotations, -np.einsum("nij,nj->ni", rotations, projected.positions)
+    own = _camera_from_map(projected.rotations, projected.positions)
     in_camera = _moved(own, points[rows])
     errors = np.sum((refined.camera.project(in_camera) - pixels) ** 2, axis=1)
     fits: BoolArray = (errors < (LIMIT * refined.deviation) ** 2) & (in_camera[:, 2] > 0.0)
     fits &= (np.bincount(rows[fits], minlength=len(points)) > 1)[rows]
     at, rows, pixels = at[fits], rows[fits], pixels[fits]
-    states = refined.spline.states(refined.times)
-    turns = np.swapaxes(states.rotations, 1, 2)
-    views = turns, -np.einsum("nij,nj->ni", turns, states.positions)
-    place = np.searchsorted(used, at)
-    of_each = views[0][place], views[1][place]
-    own = own[0][fits], own[1][fits]
+    turns, places = _camera_from_map(*refined.poses())
+    view = np.searchsorted(used, at)
+    of_each, own = (turns[view], places[view]), (own[0][fits], own[1][fits])
     moved = transferred(refined.camera, pixels, own, of_each, in_camera[fits, 2])
     apart = np.linalg.norm(refined.camera.project(_moved(of_each, points[rows])) - moved, axis=1)
     before = global_errors(camera, seen, start)[posed][fits]
@@ -110,29 +102,26 @@ def undo_shutter(
     for k, row in enumerate(used.tolist()):
         mine = at == row
         made[names[row]] = replace(
-            model.images[names[row]],
-            rotation=views[0][k],
-            translation=views[1][k] / scale,
-            pixels=moved[mine] + HALF,
-            points=model.ids[rows[mine]],
-        )
+            model.images[names[row]], rotation=turns[k], translation=places[k] / scale,
+            pixels=moved[mine] + HALF, points=model.ids[rows[mine]],
+        )  # fmt: skip
     shown = np.unique(rows)
     counts = np.bincount(rows, minlength=len(points))
     means = np.bincount(rows, apart, len(points)) / np.maximum(counts, 1)
     return GlobalShutterModel(
-        camera=refined.camera_as_found,
-        images=made,
+        camera=refined.camera_as_found, images=made,
         points=Points(model.ids[shown], points[shown] / scale, model.colors[shown], means[shown]),
-        refined=refined,
-        shutter=found,
-        readout_check=check,
-        keypoints=len(seen.landmarks),
-        before=float(np.sqrt(np.mean(before**2))),
-        after=float(np.sqrt(np.mean(apart**2))),
-    )
+        refined=refined, shutter=found, readout_check=check, keypoints=len(seen.landmarks),
+        before=float(np.sqrt(np.mean(before**2))), after=float(np.sqrt(np.mean(apart**2))),
+    )  # fmt: skip
+
+
+def _camera_from_map(rotations: Array, positions: Array) -> tuple[Array, Array]:
+    """Return the inverse of poses map_from_camera (n,3,3), (n,3)."""
+    turns = np.swapaxes(rotations, 1, 2)
+    return turns, -np.einsum("nij,nj->ni", turns, positions)
 
 
 def _moved(poses: tuple[Array, Array], points: Array) -> Array:
     """Transform points (n,3) to cameras (n)."""
-    moved: Array = np.einsum("nij,nj->ni", poses[0], points) + poses[1]
-    return moved
+    return np.asarray(np.einsum("nij,nj->ni", poses[0], points) + poses[1])

@@ -20,7 +20,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.maps.landmarks import Map, make_map
-from rs_localizer.tools.adjust.observe import ImagePoints, localize_each
+from rs_localizer.tools.adjust.observe import in_order, localize_each
 from rs_localizer.tools.adjust.spline import LONGEST_GAP, LONGEST_SPACING, Spline, spline_through
 from rs_localizer.tools.adjust.variables import Freedom, Unknowns
 from rs_localizer.tools.mapping.gauge import Similarity
@@ -110,28 +110,12 @@ class Adjusted:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapObservations:
-    """Keypoints of g images.
-
-    Raises:
-        ValueError: for arrays that do not go together.
-    """
+    """Keypoints of g images."""
 
     stamps_ns: IntArray  # (g,) ns, of the images' headers; they rise
     images: IntArray  # (n,) rows of ``stamps_ns``
     landmarks: IntArray  # (n,) rows of ``Start.points``
     pixels: Array  # (n,2) raw
-
-    def __post_init__(self) -> None:
-        count = len(self.images)
-        if self.landmarks.shape != (count,) or self.pixels.shape != (count, 2):
-            raise ValueError(
-                f"images (n,), landmarks (n,) and pixels (n,2) must be of one length, got "
-                f"{self.images.shape}, {self.landmarks.shape} and {self.pixels.shape}"
-            )
-        if np.any(np.diff(self.stamps_ns) <= 0):
-            raise ValueError("the images' stamps must rise")
-        if count and not 0 <= self.images.min() <= self.images.max() < len(self.stamps_ns):
-            raise ValueError("keypoints are of images without a stamp")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -185,27 +169,21 @@ def check(observations: MapObservations, points: int) -> None:
     shared = shared_landmarks(observations) if len(observations.images) else np.zeros(0, np.bool_)
     if not shared.any():
         raise ValueError("no overlap: no landmark is seen by two images")
-    sizes = _parts(observations, shared[observations.landmarks])
-    if len(sizes) > 1:
-        listed = ", ".join(str(size) for size in sizes[:6]) + (", ..." if len(sizes) > 6 else "")
-        raise ValueError(
-            f"the images fall into {len(sizes)} parts that share fewer than {_LEAST_SHARED} "
-            f"landmarks (of {listed} images): refine each by itself, or record what joins them"
-        )
-
-
-def _parts(observations: MapObservations, usable: BoolArray) -> list[int]:
-    """Number the connected parts of images, largest first."""
+    usable = shared[observations.landmarks]
     images, landmarks = observations.images[usable], observations.landmarks[usable]
-    ones = np.ones(len(images))
-    sees = coo_array((ones, (images, landmarks))).tocsr()
+    sees = coo_array((np.ones(len(images)), (images, landmarks))).tocsr()
     sees.data[:] = 1.0
     common = (sees @ sees.T).tocsr()
     common.data = np.where(common.data >= _LEAST_SHARED, common.data, 0.0)
     common.eliminate_zeros()
-    _, labels = connected_components(common, directed=False)
-    present = np.unique(images)
-    return sorted(np.unique(labels[present], return_counts=True)[1].tolist(), reverse=True)
+    labels = connected_components(common, directed=False)[1][np.unique(images)]
+    sizes = sorted(np.unique(labels, return_counts=True)[1].tolist(), reverse=True)
+    if len(sizes) > 1:
+        listed = ", ".join(map(str, sizes[:6])) + (", ..." if len(sizes) > 6 else "")
+        raise ValueError(
+            f"the images fall into {len(sizes)} parts that share fewer than {_LEAST_SHARED} "
+            f"landmarks (of {listed} images): refine each by itself, or record what joins them"
+        )
 
 
 def most_observed(landmarks: IntArray, images: IntArray, wanted: int) -> BoolArray:
@@ -278,10 +256,8 @@ def from_recording(
     Raises:
         ValueError: when points are not of the map, or no image has a pose.
     """
-    once = {cloud.stamp_ns: cloud for cloud in clouds if len(cloud.points)}
-    images = [once[stamp] for stamp in sorted(once)]
-    observed = [ImagePoints(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in images]
-    results = localize_each(camera, observed, done)
+    images = in_order(clouds)
+    results = localize_each(camera, images, done)
     if landmarks is None:
         landmarks = _own_map(images)
     posed = [
@@ -308,14 +284,11 @@ def from_recording(
 def _own_map(clouds: Sequence[Correspondences]) -> Map:
     """Return the points of all clouds, with their ids if they have any."""
     points = np.concatenate([cloud.points for cloud in clouds])
-    ids = None
     if all("id" in (cloud.table.dtype.names or ()) for cloud in clouds):
         every = np.concatenate([cloud.table["id"].astype(np.int64) for cloud in clouds])
         ids, firsts = np.unique(every, return_index=True)
-        points = points[firsts]
-    else:
-        points = np.unique(points, axis=0)
-    return make_map(points, ids, None, clouds[0].frame)
+        return make_map(points[firsts], ids, None, clouds[0].frame)
+    return make_map(np.unique(points, axis=0), None, None, clouds[0].frame)
 
 
 def _rows_of(landmarks: Map, cloud: Correspondences) -> IntArray:

@@ -18,8 +18,13 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import REVERSED, ScanDirection
-from rs_localizer.tools.adjust.cluster_robust import Pull, pull_at_landmarks
-from rs_localizer.tools.adjust.fit import inflation_of, left_over, steepness
+from rs_localizer.tools.adjust.fit import (
+    inflation_by_pull,
+    inflation_of,
+    left_over,
+    pull_at_landmarks,
+    steepness,
+)
 from rs_localizer.tools.adjust.intrinsics import with_lens
 from rs_localizer.tools.adjust.problem import Problem, fit_with_noise, noise_of
 from rs_localizer.tools.adjust.reprojection import LIMIT
@@ -76,12 +81,19 @@ class Refinement:
         self.size = float(np.linalg.norm(np.ptp(start.points, axis=0)))
         self.deviations, self.floating = self._known()
         self.used = self._usable()
-        self.spline = self._spline()
+        own = np.unique(seen.images[self.used])  # those that follow each other are one stretch
+        times, rotations = self.times[own], start.rotations[own]
+        self.spline = initial_trajectory(
+            times, rotations, start.positions[own], camera.readout_time,
+            following(times, rotations),
+        )  # fmt: skip
+        longest = int(np.bincount(self.spline.layout.stretches(times)).max())
+        # Images on their own tell turn and way per readout only, and not how long it takes.
+        self.tells_readout = longest >= _LEAST_STRETCH
         if freedom.readout_time and not self.tells_readout:
             raise ValueError(
                 f"estimating the readout time needs {_LEAST_STRETCH} images in a row, at most "
-                f"{LONGEST_GAP} s apart; there are {self._longest()}: give it, or more of the "
-                "recording"
+                f"{LONGEST_GAP} s apart; there are {longest}: give it, or more of the recording"
             )
         held = CONTROL * len(self.spline.positions)
         if held > _MOST_UNKNOWNS:
@@ -91,15 +103,11 @@ class Refinement:
             )
         images, pixels = seen.images[self.used], seen.pixels[self.used]
         self.seen = SplineKeypoints(
-            times=self.times[images],
-            row_times=camera.row_time(pixels),
-            pixels=pixels,
-            landmarks=start.points,
-            points=seen.landmarks[self.used],
-            frames=images,
+            camera, self.times[images], camera.row_time(pixels), pixels,
+            landmarks=start.points, points=seen.landmarks[self.used], frames=images,
             trusted=np.ones(len(images), np.bool_),
-        )
-        self.state = start_state(camera, self.seen, self.spline, camera.readout_time)
+        )  # fmt: skip
+        self.state = start_state(self.seen, self.spline, camera.readout_time)
         self.freedom: Freedom = freedom
 
     def _known(self) -> tuple[Array, bool]:
@@ -126,32 +134,15 @@ class Refinement:
         counts = np.bincount(self.shown.images[used], minlength=len(self.times))
         return used & (counts >= LEAST_KEYPOINTS)[self.shown.images]
 
-    def _spline(self) -> Spline:
-        """Return a spline through images with keypoints; those that follow are one stretch."""
-        used = np.unique(self.shown.images[self.used])
-        times, rotations = self.times[used], self.given.rotations[used]
-        follow = following(times, rotations)
-        positions, longest = self.given.positions[used], self.camera.readout_time
-        return initial_trajectory(times, rotations, positions, longest, follow)
-
-    @property
-    def tells_readout(self) -> bool:
-        """Images on their own tell turn and way per readout only, and not how long it takes."""
-        return self._longest() >= _LEAST_STRETCH
-
-    def _longest(self) -> int:
-        """Return the number of images in the longest stretch."""
-        own = self.times[np.unique(self.shown.images[self.used])]
-        return int(np.bincount(self.spline.layout.stretches(own)).max())
-
     def problem(self, freedom: Freedom, held: bool = False) -> Problem:
         """Return the problem of map and motion; ``held``: only the motion is free."""
-        views = [CameraView(self.camera, self.seen, freedom)]
+        views = [CameraView(self.seen, freedom)]
         if held:
             return Problem(views, self.state)
         return Problem(views, self.state, deviations=self.deviations, floating=self.floating)
 
     def solved(self, done: Callable[[str], object]) -> RefinedMap:
+        """Return the most likely map and motion; ``done`` is called after each part."""
         # The motion that goes with the map as it is.
         held = replace(self.freedom, readout_time=False, lens=False)
         motion = self.problem(held, held=True)
@@ -160,8 +151,7 @@ class Refinement:
         problem = self.problem(self.freedom)
         self.state, deviation = fit_with_noise(problem, self.state, before)
         done("map")
-        calmer = acceleration_prior(self.state, self.freedom)
-        if calmer is not None:
+        if (calmer := acceleration_prior(self.state, self.freedom)) is not None:
             self.freedom, problem = calmer, self.problem(calmer)
             self.state, deviation = fit_with_noise(problem, self.state, deviation)
             done("accelerations")
@@ -179,7 +169,7 @@ class Refinement:
         inflation = inflation_of(squared[inliers], deviation, used + problem.border)
         inflation = self._cluster_robust(problem, deviation, inflation)
         factored = Factored(problem.system(state, deviation, dense=True))
-        modes = np.zeros((problem.groups.kept, 0))
+        modes = np.zeros((problem.groups.kept, 0))  # errors of the motion
         if self.wanted.drifts:
             modes = DRIFT * math.sqrt(inflation) * factored.modes(self.wanted.drifts)
         whole, covariances, shared = _laid(problem, state, factored, images > 1)
@@ -196,39 +186,21 @@ class Refinement:
         found = RefinedMap(
             points=np.where(refined[:, None], points, self.given.points),
             covariances=np.where(refined[:, None, None], covariances, np.nan),
-            refined=refined,
-            sights=sights,
-            camera=self.camera,
-            readout_time=0.0,
+            refined=refined, sights=sights, camera=self.camera, readout_time=0.0,
             readout_time_deviation=math.sqrt(inflation * shared[0, 0]) if free else math.nan,
             readout_check=None if free else self._asked(deviation, inflation),
             deviation=deviation * math.sqrt(left_over(len(inliers), used)),
-            squared_errors=all_squared,
-            inliers=all_squared < (LIMIT * deviation) ** 2,
-            before=before,
-            after=deviation,
-            spline=whole.moved(state.spline),
-            start_ns=self.start_ns,
-            times=self.times,
-            tells_readout=self.tells_readout,
+            squared_errors=all_squared, inliers=all_squared < (LIMIT * deviation) ** 2,
+            before=before, after=deviation, spline=whole.moved(state.spline),
+            start_ns=self.start_ns, times=self.times, tells_readout=self.tells_readout,
             apart=self.wanted.apart,
-        )
-        found = _as_in(found, state)
-        return replace(found, drifts=self._drifts(found, problem, modes, whole))
-
-    def _drifts(
-        self, found: RefinedMap, problem: Problem, modes: Array, whole: Similarity
-    ) -> tuple[RefinedMap, ...]:
-        """Return the motion with each of the errors (N,k), laid where the map was laid.
-
-        Moves of landmarks are a difference of these, to first order: a motion that had not been
-        laid would differ by the whole similarity, of which the second order is no small error.
-        """
-        drifts, still = [], np.zeros(3 * len(self.state.landmarks))
-        for mode in modes.T:
-            state = problem.moved(self.state, np.concatenate([mode, still]))
-            drifts.append(replace(_as_in(found, state), spline=whole.moved(state.spline)))
-        return tuple(drifts)
+        )  # fmt: skip
+        # Moves of landmarks are a difference of these, to first order: a motion that had not been
+        # laid would differ by the whole similarity, of which the second order is no small error.
+        steps = np.pad(modes, ((0, 3 * count), (0, 0))).T
+        others = [problem.moved(state, step) for step in steps]
+        drifts = [replace(_as_in(found, it), spline=whole.moved(it.spline)) for it in others]
+        return replace(_as_in(found, state), drifts=tuple(drifts))
 
     def _cluster_robust(self, problem: Problem, deviation: float, independent: float) -> float:
         """Return the inflation of the covariances by errors of a second that pull together."""
@@ -236,9 +208,9 @@ class Refinement:
         rows = np.dstack([seen.values[..., -3:], seen.errors])
         inside = squared[squared < (LIMIT * deviation) ** 2]
         held, own = self.deviations**-2.0, steepness(inside, deviation) ** 2
-        pull = pull_at_landmarks(rows, self.seen.points, self.seen.times, held)
+        measured, expected = pull_at_landmarks(rows, self.seen.points, self.seen.times, held)
         own *= left_over(len(inside), self._freedoms(self.state.spline))
-        return Pull(own * pull.measured, pull.expected).inflation(independent)
+        return inflation_by_pull(own * measured, expected, independent)
 
     def _freedoms(self, spline: Spline) -> int:
         """Count the numbers of the motion that images determine: a pose each, and an end.
@@ -316,14 +288,9 @@ class RefinedMap(Adjusted):
 
 
 def refine(
-    camera: Camera,
-    seen: MapObservations,
-    start: Start,
-    freedom: MapFreedom | None = None,
-    *,
-    stamp_offset: float = 0.0,
-    done: Callable[[str], object] = lambda text: None,
-) -> RefinedMap:
+    camera: Camera, seen: MapObservations, start: Start, freedom: MapFreedom | None = None, *,
+    stamp_offset: float = 0.0, done: Callable[[str], object] = lambda text: None,
+) -> RefinedMap:  # fmt: skip
     """Return the most likely map and motion.
 
     Args:
@@ -409,12 +376,9 @@ def colmap_freedom(lens: bool) -> MapFreedom:
 
 
 def fit_shutter(
-    camera: Camera,
-    observations: MapObservations,
-    start: Start,
-    freedom: MapFreedom,
+    camera: Camera, observations: MapObservations, start: Start, freedom: MapFreedom,
     done: Callable[[str], object],
-) -> tuple[RefinedMap, ShutterFit | None]:
+) -> tuple[RefinedMap, ShutterFit | None]:  # fmt: skip
     """Refine the map with the shutter that explains the images best.
 
     A shutter is only believed if it explains them significantly better than a global one. If no
@@ -436,8 +400,9 @@ def fit_shutter(
     camera, smooth = replace(camera, readout_time=0.0), None
     with suppress(ValueError):  # what is wrong with the images is raised below
         smooth = _of_one_motion(camera, observations, start, freedom, done)
-        best = smooth[0]
-        if best.fit_share >= LEAST_FIT and best.after <= _noise(camera, observations, start):
+        best, errors = smooth[0], global_errors(camera, observations, start)
+        noise = noise_of(errors[np.isfinite(errors)] ** 2, np.inf)  # px, of the first guess
+        if best.fit_share >= LEAST_FIT and best.after <= noise:
             return smooth
     try:
         apart = refine(camera, observations, start, replace(freedom, apart=True))
@@ -471,12 +436,6 @@ def global_errors(camera: Camera, observations: MapObservations, start: Start) -
     """Return distances (n,), px, of keypoints from their global-shutter projections."""
     found = camera.project(start.local(observations)) - observations.pixels
     return np.asarray(np.linalg.norm(found, axis=1))
-
-
-def _noise(camera: Camera, observations: MapObservations, start: Start) -> float:
-    """Return the standard deviation (px) of the residuals of the first guess."""
-    errors = global_errors(camera, observations, start)
-    return noise_of(errors[np.isfinite(errors)] ** 2, np.inf)
 
 
 def _of_one_motion(

@@ -22,15 +22,14 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
-from rs_localizer.core.camera import Camera
 from rs_localizer.markers.prints import Marker, Pose
-from rs_localizer.tools.adjust.bodies import BODY, PLACE
-from rs_localizer.tools.adjust.cluster_robust import by_seconds, cluster_robust
-from rs_localizer.tools.adjust.fit import Fit, fit
+from rs_localizer.tools.adjust.fit import Fit, by_seconds, cluster_robust, fit
 from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.reprojection import LIMIT
-from rs_localizer.tools.adjust.system import System, Undetermined
+from rs_localizer.tools.adjust.system import Undetermined
 from rs_localizer.tools.adjust.variables import (
+    BODY,
+    PLACE,
     CameraView,
     Freedom,
     SplineKeypoints,
@@ -55,14 +54,12 @@ _NOISES = (10.0,) * 6 + (1.0,) * 4
 _LEAST_DIFFERENCE = 12.0
 
 
-def _problem(camera: Camera, seen: SplineKeypoints, fitted: Fit) -> Problem:
+def _problem(seen: SplineKeypoints, fitted: Fit) -> Problem:
     """Return the problem whose minimum a fit is."""
-    return Problem([CameraView(camera, seen, fitted.freedom)], fitted.state)
+    return Problem([CameraView(seen, fitted.freedom)], fitted.state)
 
 
-def _mirrored(
-    camera: Camera, seen: SplineKeypoints, fitted: Fit
-) -> tuple[BoolArray, BoolArray, Unknowns]:
+def _mirrored(seen: SplineKeypoints, fitted: Fit) -> tuple[BoolArray, BoolArray, Unknowns]:
     """Compare each marker with its mirror image, the motion held.
 
     Returns:
@@ -73,22 +70,27 @@ def _mirrored(
     # The origin, too, may lie the other way among all others.
     every = replace(seen, bodies=np.repeat(np.arange(count), 4))
     free = replace(fitted.freedom, readout_time=False)
-    problem = Problem([CameraView(camera, every, free)], fitted.state)
+    problem = Problem([CameraView(every, free)], fitted.state)
     other = replace(fitted.state, landmarks=_turned_over(seen, fitted.state))
-    for noise in _NOISES:
+    still, at = np.zeros(problem.groups.motion), np.arange(BODY * count).reshape(count, BODY)
+    for noise in _NOISES:  # each marker steps on its own
         system = problem.system(other, noise * fitted.deviation)
-        still = np.zeros(problem.groups.motion)
-        other = problem.moved(other, np.concatenate([still, _steps(system, count)]))
+        blocks = system.corner[at[:, :, None], at[:, None, :]]
+        slopes = system.slope[len(still) :][at][..., None]
+        steps = -np.linalg.solve(blocks, slopes).ravel()
+        other = problem.moved(other, np.concatenate([still, steps]))
     own, theirs = (_costs(problem, state, fitted.deviation) for state in (fitted.state, other))
     better = theirs < own
     doubtful = np.abs(theirs - own) < _LEAST_DIFFERENCE * fitted.inflation
     # A pose that came back is the same one.
     apart = _normals(other) * _normals(fitted.state)
     same = np.sum(apart, axis=1) > np.cos(0.02)
-    chosen = np.where(
-        np.repeat(better & ~same, 4)[:, None], other.landmarks, fitted.state.landmarks
-    )
-    return better & ~same, doubtful & ~same, _at_the_origin(fitted.state, chosen)
+    before, turned = fitted.state.landmarks, np.repeat(better & ~same, 4)
+    chosen = np.where(turned[:, None], other.landmarks, before)
+    back = through(chosen[:4], before[:4])  # the first four stay in place
+    landmarks = np.concatenate([before[:4], back(chosen[4:])])
+    state = replace(fitted.state, spline=back.moved(fitted.state.spline), landmarks=landmarks)
+    return better & ~same, doubtful & ~same, state
 
 
 def _turned_over(seen: SplineKeypoints, state: Unknowns) -> Array:
@@ -96,21 +98,12 @@ def _turned_over(seen: SplineKeypoints, state: Unknowns) -> Array:
     layout, corners = state.spline.layout, state.landmarks.reshape(-1, 4, 3)
     middles, markers = corners.mean(axis=1), seen.points // 4
     times = np.clip(seen.times, layout.starts.min(), layout.ends.max())
-    toward: Array = state.spline.states(times).positions - middles[markers]
-    toward /= np.linalg.norm(toward, axis=1)[:, None]
-    sums = [np.bincount(markers, of, len(corners)) for of in toward.T]
-    sight: Array = np.column_stack(sums).astype(float)
-    sight /= np.maximum(np.linalg.norm(sight, axis=1), 1e-12)[:, None]
+    toward = state.spline.states(times).positions - middles[markers]
+    toward = toward / np.linalg.norm(toward, axis=1)[:, None]
+    sight = np.column_stack([np.bincount(markers, of, len(corners)) for of in toward.T])
+    sight = sight / np.maximum(np.linalg.norm(sight, axis=1), 1e-12)[:, None]
     depth = np.einsum("mci,mi->mc", corners - middles[:, None], sight)
     return np.asarray(corners - 2.0 * depth[..., None] * sight[:, None]).reshape(-1, 3)
-
-
-def _steps(system: System, count: int) -> Array:
-    """Return steps of all markers (6 m,), each on its own."""
-    at = BODY * np.arange(count)[:, None] + np.arange(BODY)
-    slope = system.slope[system.groups.motion :]
-    blocks = system.corner[at[:, :, None], at[:, None, :]]
-    return np.asarray(-np.linalg.solve(blocks, slope[at][..., None]).ravel())
 
 
 def _costs(problem: Problem, state: Unknowns, deviation: float) -> Array:
@@ -127,14 +120,6 @@ def _normals(state: Unknowns) -> Array:
     corners = state.landmarks.reshape(-1, 4, 3)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1])
     return np.asarray(normals / np.linalg.norm(normals, axis=1)[:, None])
-
-
-def _at_the_origin(state: Unknowns, landmarks: Array) -> Unknowns:
-    """Set these landmarks (p,3), and move all so that the first four stay in place."""
-    back = through(landmarks[:4], state.landmarks[:4])
-    moved = back(landmarks)
-    moved[:4] = state.landmarks[:4]
-    return replace(state, spline=back.moved(state.spline), landmarks=moved)
 
 
 _LEAST_IMAGES = 5
@@ -204,7 +189,10 @@ def survey(filmed: Filmed, markers: Sequence[Marker], *, origin: int | None = No
         ValueError: when the images say too little, or markers fit no others, with what was found.
     """
     filmed = replace(filmed, spotted=[image for image in filmed.spotted if len(image.markers)])
-    _check(filmed, markers, origin)
+    if (shown := len(filmed.spotted)) < _LEAST_IMAGES:
+        raise ValueError(f"{shown} images show a whole marker, at least {_LEAST_IMAGES} are needed")
+    if origin is not None and not any(origin in one.markers for one in filmed.spotted):
+        raise ValueError(f"the origin, {markers[origin].name}, is in no image")
     chained = chain(filmed, markers, origin)
     if len(chained.markers) < 2:
         raise ValueError(
@@ -227,83 +215,80 @@ def survey(filmed: Filmed, markers: Sequence[Marker], *, origin: int | None = No
     return replace(found, misfits=lost + found.misfits)
 
 
-def _check(filmed: Filmed, markers: Sequence[Marker], origin: int | None) -> None:
-    if len(filmed.spotted) < _LEAST_IMAGES:
-        raise ValueError(
-            f"{len(filmed.spotted)} images show a whole marker, at least {_LEAST_IMAGES} are needed"
-        )
-    if origin is not None and not any(origin in one.markers for one in filmed.spotted):
-        raise ValueError(f"the origin, {markers[origin].name}, is in no image")
-
-
 def _adjusted(filmed: Filmed, markers: Sequence[Marker], chained: Chained) -> Survey | list[int]:
     """Return the survey, or the markers that do not fit the others."""
-    own, camera, times = _often(filmed, chained), filmed.camera, filmed.times()
+    shown = np.concatenate([filmed.spotted[k].markers for k in chained.images])
+    first_one, *others = chained.markers
+    often = [m for m in others if np.count_nonzero(shown == m) >= _LEAST_SIGHTS]
+    own, camera, times = [first_one, *often], filmed.camera, filmed.times()
     rotations = np.array([pose.rotation for pose in chained.poses])
     positions = np.array([pose.translation for pose in chained.poses])
     spline = initial_trajectory(times[chained.images], rotations, positions, camera.readout_time)
     seen = _observations(filmed, times, markers, chained, own)
     seen = seen.subset(spline.layout.inside(seen.times))
     freedom = Freedom(
-        readout_time=not camera.readout_time > 0.0,
-        angular_velocity=ANGULAR_VELOCITY,
-        linear_velocity=LINEAR_VELOCITY,
-        least_noise=_LEAST_NOISE,
-    )
-    start = start_state(camera, seen, spline, camera.readout_time)
+        readout_time=not camera.readout_time > 0.0, angular_velocity=ANGULAR_VELOCITY,
+        linear_velocity=LINEAR_VELOCITY, least_noise=_LEAST_NOISE,
+    )  # fmt: skip
+    start = start_state(seen, spline, camera.readout_time)
     # Far off, as at the end of a chain, large errors are no outliers.
-    errors = np.sqrt(Problem([CameraView(camera, seen, freedom)], start).errors(start))
+    errors = np.sqrt(Problem([CameraView(seen, freedom)], start).errors(start))
     first = float(np.clip(np.median(errors), *_FIRST_NOISE))
-    fitted = fit(camera, seen, start, freedom, first)
-    calmer = acceleration_prior(fitted.state, freedom)
-    if calmer is not None:
-        fitted = fit(camera, seen, fitted.state, calmer, fitted.deviation)
-    fitted, doubtful = _right_side_up(camera, seen, fitted)
-    fitted = _less_noise(camera, seen, fitted)
-    _check_fit(fitted)
+    fitted = fit(seen, start, freedom, first)
+    if (calmer := acceleration_prior(fitted.state, freedom)) is not None:
+        fitted = fit(seen, fitted.state, calmer, fitted.deviation)
+    fitted, doubtful = _right_side_up(seen, fitted)
+    fitted = _less_noise(seen, fitted)
+    share = float(np.mean(fitted.inliers))
+    if share < _LEAST_FIT:
+        raise ValueError(
+            f"{100 * share:.0f} % of the corners fit the survey, {100 * _LEAST_FIT:.0f} % should: "
+            f"check the readout time and the calibration; {MISFIT}"
+        )
     fits, misfits = _fitting(seen, fitted, len(own))
     if misfits.any():
         return [own[k] for k in np.flatnonzero(misfits)]
-    fitted = cluster_robust(_problem(camera, seen, fitted), fitted)
+    fitted = cluster_robust(_problem(seen, fitted), fitted)
     corners = fitted.state.landmarks.reshape(-1, 4, 3)
-    placed = [
-        Marker(markers[m].family, markers[m].id, of) for m, of in zip(own, corners, strict=True)
-    ]
     counts = np.bincount(seen.points[fitted.inliers] // 4, minlength=len(own)) // 4
     known = np.flatnonzero(fits & (counts >= _LEAST_SIGHTS) & ~doubtful)
     order = [0, *sorted(known[known > 0].tolist(), key=lambda k: own[k])]
-    covariance = _covariance(fitted, order)
+    # In the border, too, markers come last: all but the origin.
+    begin = len(fitted.border_covariance) - BODY * len(own)
+    columns = (begin + BODY * np.array(order[1:])[:, None] + np.arange(BODY)).ravel()
+    covariance = np.pad(fitted.border_covariance[np.ix_(columns, columns)], (BODY, 0))
     done = Survey(
-        tuple(placed[k] for k in order),
-        covariance,
-        of_the_shape(covariance, corners[order]),
-        tuple(int(counts[k]) for k in order),
+        tuple(Marker(markers[own[k]].family, markers[own[k]].id, corners[k]) for k in order),
+        covariance, of_the_shape(covariance, corners[order]), tuple(int(counts[k]) for k in order),
         tuple(tuple(markers[m] for m in part) for part in chained.apart),
-        tuple(markers[m] for m in chained.markers if m not in {own[k] for k in order}),
-        (),
-        fitted,
-        _shutter(camera, seen, fitted),
-        len(chained.images),
-    )
-    _check_places(done)
+        tuple(markers[m] for m in chained.markers if m not in {own[k] for k in order}), (), fitted,
+        _shutter(seen, fitted), len(chained.images),
+    )  # fmt: skip
+    if np.mean(done.poor) > 0.5:
+        off = np.median(np.linalg.norm(done.deviations_of_shape[:, :PLACE], axis=1))
+        size = np.median([marker.size for marker in done.markers])
+        raise ValueError(
+            f"most markers would be known to {1e3 * off:.0f} mm only, of {1e3 * size:.0f} mm: go "
+            "nearer, for longer, with a sharper picture, and show more of them at once"
+        )
     return done
 
 
-def _right_side_up(camera: Camera, seen: SplineKeypoints, fitted: Fit) -> tuple[Fit, BoolArray]:
+def _right_side_up(seen: SplineKeypoints, fitted: Fit) -> tuple[Fit, BoolArray]:
     """Turn all markers as they fit best; return also a mask (m,) of undecided ones."""
     for _ in range(_MOST_TURNS):
-        better, doubtful, other = _mirrored(camera, seen, fitted)
+        better, doubtful, other = _mirrored(seen, fitted)
         if not better.any():
             break
-        turned = fit(camera, seen, other, fitted.freedom, fitted.deviation)
-        system = _problem(camera, seen, fitted).system(turned.state, fitted.deviation)
+        turned = fit(seen, other, fitted.freedom, fitted.deviation)
+        system = _problem(seen, fitted).system(turned.state, fitted.deviation)
         if system.cost > fitted.cost:
             break
         fitted = turned
     return fitted, doubtful
 
 
-def _less_noise(camera: Camera, seen: SplineKeypoints, fitted: Fit) -> Fit:
+def _less_noise(seen: SplineKeypoints, fitted: Fit) -> Fit:
     """Fit again with corners that are better than was assumed.
 
     If they weigh too little, the prior of the accelerations wins, and the readout time suffers.
@@ -311,17 +296,7 @@ def _less_noise(camera: Camera, seen: SplineKeypoints, fitted: Fit) -> Fit:
     noise = fitted.deviation * math.sqrt(fitted.inflation)
     if fitted.deviation > _LEAST_NOISE or noise > _LEAST_NOISE:
         return fitted
-    return fit(camera, seen, fitted.state, replace(fitted.freedom, least_noise=noise), noise)
-
-
-def _covariance(fitted: Fit, order: list[int]) -> Array:
-    """Return the covariance (6 m, 6 m) of markers in an order that starts at the origin."""
-    shared = len(fitted.border_covariance) - BODY * (len(fitted.state.landmarks) // 4 - 1)
-    places = np.array(order[1:])[:, None] - 1
-    columns = (shared + BODY * places + np.arange(BODY)).ravel()
-    covariance = np.zeros((BODY * len(order),) * 2)
-    covariance[BODY:, BODY:] = fitted.border_covariance[np.ix_(columns, columns)]
-    return covariance
+    return fit(seen, fitted.state, replace(fitted.freedom, least_noise=noise), noise)
 
 
 def _fitting(seen: SplineKeypoints, fitted: Fit, count: int) -> tuple[BoolArray, BoolArray]:
@@ -350,46 +325,21 @@ def _fitting(seen: SplineKeypoints, fitted: Fit, count: int) -> tuple[BoolArray,
     return fits, ~fits & often
 
 
-def _check_fit(fitted: Fit) -> None:
-    share = float(np.mean(fitted.inliers))
-    if share < _LEAST_FIT:
-        raise ValueError(
-            f"{100 * share:.0f} % of the corners fit the survey, {100 * _LEAST_FIT:.0f} % should: "
-            f"check the readout time and the calibration; {MISFIT}"
-        )
-
-
-def _check_places(survey: Survey) -> None:
-    if np.mean(survey.poor) > 0.5:
-        off = np.median(np.linalg.norm(survey.deviations_of_shape[:, :PLACE], axis=1))
-        size = np.median([marker.size for marker in survey.markers])
-        raise ValueError(
-            f"most markers would be known to {1e3 * off:.0f} mm only, of {1e3 * size:.0f} mm: go "
-            "nearer, for longer, with a sharper picture, and show more of them at once"
-        )
-
-
-def _shutter(camera: Camera, seen: SplineKeypoints, fitted: Fit) -> Adjusted:
+def _shutter(seen: SplineKeypoints, fitted: Fit) -> Adjusted:
     """Return the camera, with the readout time that corners ask for instead of a given one."""
-    asked, known = fitted, camera.readout_time > 0.0
+    camera, asked = seen.camera, fitted
+    known = camera.readout_time > 0.0
     if known:
         free = replace(fitted.freedom, readout_time=True)
-        asked = fit(camera, seen, fitted.state, free, fitted.deviation)
-        asked = cluster_robust(_problem(camera, seen, asked), asked)
-    problem = _problem(camera, seen, asked)
+        asked = fit(seen, fitted.state, free, fitted.deviation)
+        asked = cluster_robust(_problem(seen, asked), asked)
+    problem = _problem(seen, asked)
     apart = disagreement(*by_seconds(problem, asked, problem.place("readout")))
     deviation, wanted = apart * asked.readout_time_deviation, asked.state.readout_time
     if not known:
         return Adjusted(camera, wanted, deviation, None)
     check = ReadoutCheck(camera.readout_time, wanted, deviation)
     return Adjusted(camera, camera.readout_time, math.nan, check)
-
-
-def _often(filmed: Filmed, chained: Chained) -> list[int]:
-    """Return the origin first, then the other markers that enough images show."""
-    shown = np.concatenate([filmed.spotted[k].markers for k in chained.images])
-    origin, *others = chained.markers
-    return [origin, *(m for m in others if np.count_nonzero(shown == m) >= _LEAST_SIGHTS)]
 
 
 def _observations(
@@ -411,12 +361,7 @@ def _observations(
     ])  # fmt: skip
     all_pixels, all_frames = np.concatenate(pixels), np.array(frames, np.int64)
     return SplineKeypoints(
-        times=times[all_frames],
-        row_times=filmed.camera.row_time(all_pixels),
-        pixels=all_pixels,
-        landmarks=landmarks,
-        points=np.array(points, np.int64),
-        frames=all_frames,
-        trusted=np.ones(len(all_frames), np.bool_),
+        filmed.camera, times[all_frames], filmed.camera.row_time(all_pixels), all_pixels, landmarks,
+        np.array(points, np.int64), all_frames, np.ones(len(all_frames), np.bool_),
         bodies=np.repeat(np.arange(len(own)) - 1, 4),
-    )
+    )  # fmt: skip

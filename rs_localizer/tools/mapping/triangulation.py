@@ -46,8 +46,7 @@ class Triangulated:
     @property
     def spread(self) -> Array:
         """Standard deviation (p,) of a point's place."""
-        spread: Array = np.sqrt(np.trace(self.covariances, axis1=1, axis2=2))
-        return spread
+        return np.asarray(np.sqrt(np.trace(self.covariances, axis1=1, axis2=2)))
 
     def chosen(self, rows: IntArray) -> Triangulated:
         """Return some (p,) of the points, with the keypoints of all."""
@@ -117,10 +116,8 @@ def moves(
 
 def _nearest_to_rays(camera: Camera, sights: Sights, count: int) -> Array:
     """Return points (p,3) nearest to the rays; NaN for parallel rays."""
-    rays = camera.rays(sights.pixels)
-    directions = np.einsum(
-        "nij,nj->ni", sights.rotations, np.column_stack([rays, np.ones(len(rays))])
-    )
+    rays = np.column_stack([camera.rays(sights.pixels), np.ones(len(sights.pixels))])
+    directions = np.einsum("nij,nj->ni", sights.rotations, rays)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     usable = np.isfinite(directions).all(axis=1)
     directions = np.nan_to_num(directions)
@@ -128,9 +125,8 @@ def _nearest_to_rays(camera: Camera, sights: Sights, count: int) -> Array:
     across[~usable] = 0.0
     normal = _sums(across, sights.points, count)
     places = _sums(np.einsum("nij,nj->ni", across, sights.positions), sights.points, count)
-    least = np.linalg.eigvalsh(normal)[:, 0] / np.maximum(
-        np.bincount(sights.points[usable], minlength=count), 1
-    )
+    counts = np.bincount(sights.points[usable], minlength=count)
+    least = np.linalg.eigvalsh(normal)[:, 0] / np.maximum(counts, 1)
     nearest: Array = np.einsum("pij,pj->pi", _inverses(normal), places)
     nearest[least < _LEAST_SPREAD] = np.nan
     return nearest
@@ -161,7 +157,6 @@ def _inverses(matrices: Array) -> Array:
 
 def _sums(values: Array, groups: IntArray, count: int) -> Array:
     """Return sums (count,...) of values (n,...) by group (n,)."""
-    picks = csr_array(
-        (np.ones(len(groups)), (groups, np.arange(len(groups)))), shape=(count, len(groups))
-    )
+    n = len(groups)
+    picks = csr_array((np.ones(n), (groups, np.arange(n))), shape=(count, n))
     return np.asarray(picks @ values.reshape(len(values), -1)).reshape(count, *values.shape[1:])

@@ -9,6 +9,7 @@ agrees for the true poses only; by what agrees most, all are chained.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -76,12 +77,11 @@ class Spotter:
     def spot(self, image: NDArray[np.uint8], stamp_ns: int) -> Spotted:
         """Return the markers of an image (h,w)."""
         found = self._detector.detect(image, stamp_ns)
-        place = {int(id_): row for row, id_ in enumerate(found.ids) if id_ < self._end}
-        every = {id_ // 4 for id_ in place}
-        whole = sorted(m for m in every if all(4 * m + k in place for k in range(4)))
-        rows = np.array([[place[4 * m + k] for k in range(4)] for m in whole], np.int64)
-        quads = found.pixels[rows.reshape(-1)].reshape(-1, 4, 2)
-        return Spotted(stamp_ns, np.array(whole, np.int64), quads)
+        ids, rows = np.unique(found.ids[found.ids < self._end], return_index=True)
+        counts = np.bincount(ids // 4)
+        rows = rows[counts[ids // 4] == 4]  # of whole markers
+        quads = found.pixels[found.ids < self._end][rows].reshape(-1, 4, 2)
+        return Spotted(stamp_ns, np.flatnonzero(counts == 4), quads)
 
 
 # Images of a pair that are compared, evenly chosen.
@@ -193,11 +193,11 @@ def _between(
     views: list[list[_MarkerSight]], markers: Sequence[Marker]
 ) -> dict[tuple[int, int], tuple[Transform, float]]:
     """Return transforms a_from_b of each pair a < b, and the number of images that support them."""
-    images: dict[tuple[int, int], list[tuple[_MarkerSight, _MarkerSight]]] = {}
+    images = defaultdict[tuple[int, int], list[tuple[_MarkerSight, _MarkerSight]]](list)
     for view in views:
         for one, other in combinations(sorted(view, key=lambda sight: sight.marker), 2):
             if one.marker != other.marker:
-                images.setdefault((one.marker, other.marker), []).append((one, other))
+                images[one.marker, other.marker].append((one, other))
     between = {}
     for (a, b), among in images.items():
         said = [
@@ -241,24 +241,20 @@ def _image_poses(
     images: list[int] = []
     poses: list[Transform] = []
     for k, view in enumerate(views):
-        own = [sight for sight in view if sight.marker in placed]
+        own = [(sight, placed[sight.marker]) for sight in view if sight.marker in placed]
         if not own:
             continue
         points = np.concatenate([
-            markers[of.marker].corners @ placed[of.marker].rotation.T
-            + placed[of.marker].translation
-            for of in own
+            markers[of.marker].corners @ place.rotation.T + place.translation for of, place in own
         ])  # fmt: skip
-        rays = np.concatenate([of.rays for of in own])
-        options = [pose @ placed[of.marker].inverse() for of in own for pose, _ in of.poses]
+        rays = np.concatenate([of.rays for of, _ in own])
+        options = [pose @ place.inverse() for of, place in own for pose, _ in of.poses]
         costs = np.array([_cost(option, points, rays) for option in options])
         best = options[int(np.argmin(costs))]
         if images and times[k] - times[images[-1]] < _NEAR:
-            alike = np.flatnonzero(costs <= _ALIKE * costs.min()).tolist()
             before = poses[-1].rotation
-            best = max(
-                (options[m] for m in alike), key=lambda of: float(np.sum(of.rotation.T * before))
-            )
+            alike = [options[m] for m in np.flatnonzero(costs <= _ALIKE * costs.min())]
+            best = max(alike, key=lambda of: float(np.sum(of.rotation.T * before)))
         images.append(k)
         poses.append(best.inverse())
     return images, poses

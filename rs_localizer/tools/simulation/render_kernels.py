@@ -27,15 +27,9 @@ _ZERO = np.float32(0.0)
 
 @entry
 def render_lines(
-    rays: SingleArray4,
-    homographies: SingleArray5,
-    texels: ByteArray1,
-    levels: IntArray3,
-    background: float,
-    first: int,
-    last: int,
-    image: Out[SingleArray2],
-) -> None:
+    rays: SingleArray4, homographies: SingleArray5, texels: ByteArray1, levels: IntArray3,
+    background: float, first: int, last: int, image: Out[SingleArray2],
+) -> None:  # fmt: skip
     """Write the mean grey level of each pixel in the lines ``first`` to before ``last``.
 
     Every pixel averages its rays over all instants of its exposure. A ray takes the nearest

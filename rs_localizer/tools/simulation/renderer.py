@@ -50,10 +50,9 @@ def _reductions(texture: Image) -> list[Image]:
         image = images[-1]
         # Texels stay squares of 2^level: an odd last row or column stands for a pair.
         even = np.pad(image, [(0, size % 2) for size in image.shape], mode="edge")
-        half = cv2.resize(
-            even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA
-        )
-        images.append(np.asarray(half, np.uint8).reshape(even.shape[0] // 2, even.shape[1] // 2))
+        height, width = (size // 2 for size in even.shape)
+        half = cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA)
+        images.append(np.asarray(half, np.uint8).reshape(height, width))
     return images
 
 
@@ -124,16 +123,12 @@ class Renderer:
         if exposure == 0.0:
             return np.zeros(1)
         state = motion.state(middle_ns, np.zeros(1))
-        nearest = min(
-            abs(float((state.positions[0] - plane.corner) @ plane.normal)) for plane in self.planes
-        )
-        speed = np.linalg.norm(state.angular[0]) + np.linalg.norm(state.linear[0]) / max(
-            nearest, _NEAREST
-        )
+        away = (abs((state.positions[0] - one.corner) @ one.normal) for one in self.planes)
+        nearest = max(float(min(away)), _NEAREST)
+        speed = np.linalg.norm(state.angular[0]) + np.linalg.norm(state.linear[0]) / nearest
         travel = float(speed * exposure * self.camera.K[0, 0] / self.camera.binning[0])
         count = min(max(math.ceil(travel / _LONGEST_STEP), 1), _MOST_INSTANTS)
-        offsets: Array = exposure * ((np.arange(count) + 0.5) / count - 0.5)
-        return offsets
+        return np.asarray(exposure * ((np.arange(count) + 0.5) / count - 0.5))
 
 
 def _rays(camera: Camera, sideways: bool) -> NDArray[np.float32]:
@@ -178,22 +173,16 @@ def rendered_frames(
     def frame(numbered: tuple[int, int]) -> RenderedFrame:
         index, stamp_ns = numbered
         middle_ns = middle_stamp(renderer.camera, stamp_ns)
+        image = renderer.image(motion, stamp_ns, (seed, index))
+        done, data = cv2.imencode(f".{FORMAT}", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+        assert done
         return RenderedFrame(
-            stamp_ns=stamp_ns,
-            middle_ns=middle_ns,
-            data=_jpeg(renderer.image(motion, stamp_ns, (seed, index))),
-            first_row=motion.state(stamp_ns, now),
-            middle_row=motion.state(middle_ns, now),
-        )
+            stamp_ns=stamp_ns, middle_ns=middle_ns, data=data.tobytes(),
+            first_row=motion.state(stamp_ns, now), middle_row=motion.state(middle_ns, now),
+        )  # fmt: skip
 
     # A few at a time wait to be taken.
     numbered = list(enumerate(stamps_ns))
     with ThreadPoolExecutor(_WORKERS) as pool:
         for first in range(0, len(numbered), 2 * _WORKERS):
             yield from pool.map(frame, numbered[first : first + 2 * _WORKERS])
-
-
-def _jpeg(image: Image) -> bytes:
-    done, data = cv2.imencode(f".{FORMAT}", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    assert done
-    return bytes(data.tobytes())

@@ -58,5 +58,4 @@ def _boxes(
     axis = rng.integers(3, size=count)
     rows = np.arange(count)
     offsets[rows, axis] = np.copysign(half[box, axis], offsets[rows, axis])
-    points: Array = centres[box] + offsets
-    return points
+    return np.asarray(centres[box] + offsets)

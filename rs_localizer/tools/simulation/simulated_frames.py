@@ -93,14 +93,9 @@ def true_poses_at(
 
 
 def simulate_frames(
-    camera: Camera,
-    motion: TrueMotion,
-    map_points: Array,
-    settings: FrameSettings,
-    *,
-    stamps_ns: list[int] | None = None,
-    seed: int = 0,
-) -> Iterator[SimulatedFrame]:
+    camera: Camera, motion: TrueMotion, map_points: Array, settings: FrameSettings, *,
+    stamps_ns: list[int] | None = None, seed: int = 0,
+) -> Iterator[SimulatedFrame]:  # fmt: skip
     """Yield the frames that a camera sees of a map (m,3) along a motion.
 
     Args:
@@ -118,26 +113,17 @@ def simulate_frames(
         pixels = pixels + rng.normal(0.0, settings.noise, size=pixels.shape)
         uniform = rng.uniform(-0.5, np.array(camera.size) - 0.5, size=pixels.shape)
         yield SimulatedFrame(
-            stamp_ns=stamp_ns,
-            middle_ns=middle_ns,
-            ids=ids,
-            points=map_points[ids],
-            pixels=np.where(inliers[:, None], pixels, uniform),
-            inliers=inliers,
-            first_row=motion.state(stamp_ns, now),
-            middle_row=motion.state(middle_ns, now),
+            stamp_ns=stamp_ns, middle_ns=middle_ns, ids=ids, points=map_points[ids],
+            pixels=np.where(inliers[:, None], pixels, uniform), inliers=inliers,
+            first_row=motion.state(stamp_ns, now), middle_row=motion.state(middle_ns, now),
             readout_time=camera.readout_time,
-        )
+        )  # fmt: skip
 
 
 def _visible(
-    camera: Camera,
-    motion: TrueMotion,
-    middle_ns: int,
-    map_points: Array,
-    settings: FrameSettings,
+    camera: Camera, motion: TrueMotion, middle_ns: int, map_points: Array, settings: FrameSettings,
     rng: np.random.Generator,
-) -> tuple[NDArray[np.int64], Array]:
+) -> tuple[NDArray[np.int64], Array]:  # fmt: skip
     """Draw points that some row sees: their ids (n,) and true pixels (n,2)."""
     poses_at = true_poses_at(camera, motion, middle_ns)
     size = np.array(camera.size)

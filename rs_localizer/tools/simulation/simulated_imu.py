@@ -8,7 +8,6 @@ of it is made of what the estimators assume.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -123,7 +122,14 @@ def simulate_imu(
             for first, last in motion.intervals_ns
         ]
     )
-    parts = [_true(motion, chunk, lever) for chunk in _chunks(times)]
+    # Cut where a motion has gaps, and where rounding of seconds would begin to show.
+    steps = np.diff(times, prepend=times[:1])[1:]
+    ends = np.flatnonzero(steps > 2 * np.median(steps)) + 1
+    parts = [
+        _true(motion, chunk, lever)
+        for part in np.split(times, ends)
+        for chunk in np.split(part, range(_CHUNK, len(part), _CHUNK))
+    ]
     rates, forces = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     shape, root = (len(times), 3), math.sqrt(settings.rate)
     walk = rng.normal(0.0, settings.gyroscope_bias_walk / root, shape)
@@ -140,29 +146,17 @@ def simulate_imu(
     )  # fmt: skip
 
 
-def _chunks(times: IntArray) -> Iterator[IntArray]:
-    """Return the cut where a motion has gaps, and where rounding of seconds would begin to show."""
-    steps = np.diff(times, prepend=times[:1])[1:]
-    ends = np.flatnonzero(steps > 2 * np.median(steps)) + 1
-    for part in np.split(times, ends):
-        yield from np.split(part, range(_CHUNK, len(part), _CHUNK))
-
-
 def _true(motion: TrueMotion, times: IntArray, lever: Lever) -> tuple[Array, Array]:
     """Return the body rates and specific forces (n,3) in IMU axes."""
-    offsets = (times - times[0]) * 1e-9
-    state = motion.state(int(times[0]), offsets)
-    ends = [_velocity(motion, times, offsets + shift, lever) for shift in (-_STEP, _STEP)]
+    offsets, first_ns = (times - times[0]) * 1e-9, int(times[0])
+    state, ends = motion.state(first_ns, offsets), []
+    for shift in (-_STEP, _STEP):
+        there = motion.state(first_ns, offsets + shift)
+        velocity = there.linear + np.cross(there.angular, lever.position)
+        ends.append(np.einsum("nij,nj->ni", there.rotations, velocity))
     acceleration = (ends[1] - ends[0]) / (2.0 * _STEP)
     force = np.einsum("nji,nj->ni", state.rotations, acceleration - _GRAVITY)
     return state.angular @ lever.rotation, force @ lever.rotation
-
-
-def _velocity(motion: TrueMotion, times: IntArray, offsets: Array, lever: Lever) -> Array:
-    """Return the velocities (n,3) of the IMU in the map."""
-    state = motion.state(int(times[0]), offsets)
-    velocity = state.linear + np.cross(state.angular, lever.position)
-    return np.asarray(np.einsum("nij,nj->ni", state.rotations, velocity), np.float64)
 
 
 def _direction(rng: np.random.Generator) -> Array:

@@ -80,12 +80,9 @@ TRUE_TWIST_TOPIC = "/truth/twist"
 
 
 def write_simulated(
-    bag: BagWriter,
-    camera: Camera,
-    frame: SimulatedFrame | RenderedFrame,
-    keypoints: NDArray[Any] | None = None,
-    later_ns: int = 0,
-) -> None:
+    bag: BagWriter, camera: Camera, frame: SimulatedFrame | RenderedFrame,
+    keypoints: NDArray[Any] | None = None, later_ns: int = 0,
+) -> None:  # fmt: skip
     """Write what a camera sees, and the truth at first and middle row.
 
     Args:
@@ -121,34 +118,25 @@ def view_messages(
 
 
 def write_truth(
-    bag: BagWriter,
-    stamp_ns: int,
-    state: TrueState,
-    body: str = CAMERA_FRAME,
+    bag: BagWriter, stamp_ns: int, state: TrueState, body: str = CAMERA_FRAME,
     recorded_ns: int | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Write pose and twist of a body in the map, recorded at its time or another."""
     pose = make_message(
-        "geometry_msgs/msg/PoseStamped",
-        header=make_header(make_message, stamp_ns, MAP_FRAME),
-        pose=make_message(
-            "geometry_msgs/msg/Pose",
-            position=make_vector(make_message, state.positions[0], "Point"),
-            orientation=make_quaternion(make_message, state.rotations[0]),
-        ),
+        "geometry_msgs/msg/Pose",
+        position=make_vector(make_message, state.positions[0], "Point"),
+        orientation=make_quaternion(make_message, state.rotations[0]),
     )
-    twist = make_message(
-        "geometry_msgs/msg/TwistStamped",
-        header=make_header(make_message, stamp_ns, body),
-        twist=make_message(
-            "geometry_msgs/msg/Twist",
-            linear=make_vector(make_message, state.linear[0]),
-            angular=make_vector(make_message, state.angular[0]),
-        ),
-    )
+    linear, angular = (make_vector(make_message, of[0]) for of in (state.linear, state.angular))
+    twist = make_message("geometry_msgs/msg/Twist", linear=linear, angular=angular)
     recorded_ns = stamp_ns if recorded_ns is None else recorded_ns
-    bag.write(TRUE_POSE_TOPIC, pose, recorded_ns)
-    bag.write(TRUE_TWIST_TOPIC, twist, recorded_ns)
+    for topic, kind, frame, name, value in (
+        (TRUE_POSE_TOPIC, "PoseStamped", MAP_FRAME, "pose", pose),
+        (TRUE_TWIST_TOPIC, "TwistStamped", body, "twist", twist),
+    ):
+        header = make_header(make_message, stamp_ns, frame)
+        message = make_message(f"geometry_msgs/msg/{kind}", **{"header": header, name: value})
+        bag.write(topic, message, recorded_ns)
 
 
 # Relative error of the rates of cameras' oscillators: common quartz.
@@ -250,12 +238,9 @@ def rig_parameters(parts: RigParts) -> dict[str, Any]:
 
 
 def write_rig_frame(
-    bag: BagWriter,
-    parts: RigParts,
-    motion: TrueMotion,
-    image: RigFrame,
+    bag: BagWriter, parts: RigParts, motion: TrueMotion, image: RigFrame,
     keypoints: NDArray[Any] | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Write camera info and content of a camera, and the rig's truth.
 
     The truth is of when its first and its middle row were exposed.

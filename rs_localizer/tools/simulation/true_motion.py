@@ -130,10 +130,11 @@ class _Stretch:
     """One spline in seven columns: position and a quaternion that is normalized afterwards."""
 
     def __init__(self, part: Trajectory, knot_spacing: float) -> None:
-        self.start_ns = int(part.stamps_ns[0])
-        self.end_ns = int(part.stamps_ns[-1])
+        self.start_ns, self.end_ns = part.stamps_ns[[0, -1]].tolist()
         t = np.asarray((part.stamps_ns - self.start_ns) * 1e-9, np.float64)
-        values = np.hstack([part.positions, _continuous(part.quaternions)])
+        q = part.quaternions  # without jumps between q and -q
+        flips = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0)
+        values = np.hstack([part.positions, q * np.cumprod(np.r_[1.0, flips])[:, None]])
         self._spline = _spline(t, values, knot_spacing)
         self._rate = self._spline.derivative()
 
@@ -148,19 +149,9 @@ class _Stretch:
             q[:, 3:] * q_rate[:, :3] - q_rate[:, 3:] * q[:, :3] - np.cross(q[:, :3], q_rate[:, :3])
         )
         return TrueState(
-            rotations,
-            values[:, :3],
-            body_rate @ BODY_FROM_CAMERA,
+            rotations, values[:, :3], body_rate @ BODY_FROM_CAMERA,
             np.einsum("nji,nj->ni", rotations, rates[:, :3]),
-        )
-
-
-def _continuous(quaternions: Array) -> Array:
-    """Return the same rotations without jumps between q and -q."""
-    flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0
-    signs = np.cumprod(np.concatenate([[1.0], np.where(flips, -1.0, 1.0)]))
-    continuous: Array = quaternions * signs[:, None]
-    return continuous
+        )  # fmt: skip
 
 
 def _spline(t: Array, values: Array, knot_spacing: float) -> Any:

@@ -50,8 +50,7 @@ class TexturedPlane:
     def points(self, texels: Array) -> Array:
         """Return points (n,3) of the map at texel coordinates (n,2), counted from the corner."""
         across, along = self.texel * np.asarray(texels, float).T
-        points: Array = self.corner + across[:, None] * self.right + along[:, None] * self.down
-        return points
+        return np.asarray(self.corner + across[:, None] * self.right + along[:, None] * self.down)
 
     def homographies(self, rotations: Array, positions: Array) -> Array:
         """Return homographies (n,3,3) from bearings to texels, for n cameras.

@@ -67,4 +67,4 @@ def fitting(problem: Problem, state: Unknowns) -> Problem:
         ))
         for view, seen in zip(problem.views, problem.sights(state), strict=True)
     ]  # fmt: skip
-    return problem.of_views(views, state)
+    return Problem(views, state, deviations=problem.deviations, floating=bool(problem.floating))

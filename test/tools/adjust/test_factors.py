@@ -116,15 +116,15 @@ def small(
     count = 60
     pixels, frames = rng.uniform(0.0, 400.0, (count, 2)), np.sort(rng.integers(0, 5, count))
     seen = SplineKeypoints(
-        times=0.05 + 0.07 * frames, row_times=camera.row_time(pixels), pixels=pixels,
+        camera, 0.05 + 0.07 * frames, camera.row_time(pixels), pixels,
         landmarks=landmarks, points=rng.integers(0, 8, count), frames=frames,
         trusted=np.ones(count, bool),
         bodies=np.repeat([-1, 0], 4) if of == "bodies" else None,
     )  # fmt: skip
-    state = start_state(camera, seen, spline, READOUT)
+    state = start_state(seen, spline, READOUT)
     extrinsics = MOUNTED if FREEDOMS[of].mount else state.extrinsics
     state = replace(state, delays=rng.normal(0.0, 1e-3, 5), extrinsics=extrinsics)
-    return fitting(Problem([CameraView(camera, seen, FREEDOMS[of])], state), state), state
+    return fitting(Problem([CameraView(seen, FREEDOMS[of])], state), state), state
 
 
 @pytest.mark.parametrize("of", list(FREEDOMS))

@@ -24,9 +24,10 @@ def observe(camera: Camera, frames: list[projector.Frame]) -> SplineKeypoints:
     landmarks, rows = np.unique(points, axis=0, return_inverse=True)
     pixels = np.concatenate([frame.pixels for frame in frames])
     return SplineKeypoints(
+        camera,
         times=np.repeat([frame.stamp for frame in frames], counts),
-        row_times=camera.row_time(pixels),
         pixels=pixels,
+        row_times=camera.row_time(pixels),
         landmarks=landmarks,
         points=rows.ravel(),
         frames=np.repeat(np.arange(len(frames)), counts),
@@ -52,8 +53,8 @@ def test_truth_without_noise():
     frames = projector.record(rng, motion, projector.room(rng), readout=READOUT, seconds=2.0,
                               noise=0.0)  # fmt: skip
     seen = observe(camera, frames)
-    start = start_state(camera, seen, guess(rng, motion, frames, 1 / 60))
-    found = fit(camera, seen, start, Freedom(angular_acceleration=1e4, linear_acceleration=1e4))
+    start = start_state(seen, guess(rng, motion, frames, 1 / 60), 0.0)
+    found = fit(seen, start, Freedom(angular_acceleration=1e4, linear_acceleration=1e4))
     assert found.state.readout_time == pytest.approx(READOUT, abs=2e-6)
     assert np.sqrt(found.squared_errors.max()) < 0.02
     times = np.linspace(0.2, 1.8, 20)
@@ -71,8 +72,8 @@ def test_noise_outliers_and_columns_that_are_read_backwards():
     seen = observe(camera, frames)
     # Half of the outliers pass for inliers of their frame.
     half = seen.trusted | (rng.random(len(seen.trusted)) < 0.1)
-    start = start_state(camera, seen, guess(rng, motion, frames))
-    found = fit(camera, replace(seen, trusted=half), start, Freedom())
+    start = start_state(seen, guess(rng, motion, frames), 0.0)
+    found = fit(replace(seen, trusted=half), start, Freedom())
     assert abs(found.state.readout_time - readout) < 4.0 * found.readout_time_deviation < 2e-4
     assert found.deviation == pytest.approx(0.3, rel=0.06)
     assert np.mean(found.inliers == seen.trusted) > 0.99
@@ -99,8 +100,8 @@ def test_a_wrong_lens_and_a_bent_board_are_found():
     believed = [replace(f, points=flat[[np.flatnonzero((bent == p).all(axis=1))[0]
                 for p in f.points]]) for f in frames if len(f.points) >= 12]  # fmt: skip
     seen = observe(wrong, believed)
-    start = start_state(wrong, seen, guess(rng, motion, believed))
-    found = fit(wrong, seen, start, Freedom(lens=True, landmarks=2e-3))
+    start = start_state(seen, guess(rng, motion, believed), 0.0)
+    found = fit(seen, start, Freedom(lens=True, landmarks=2e-3))
     assert abs(found.state.readout_time - READOUT) < 4.0 * found.readout_time_deviation < 4e-4
     assert found.camera.K[0, 0] == pytest.approx(TRUE.focal, rel=3e-3)
     assert found.deviation == pytest.approx(0.1, rel=0.1)

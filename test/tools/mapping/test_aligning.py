@@ -11,7 +11,7 @@ from rs_localizer.core import so3
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.prints import Marker, Pose
-from rs_localizer.tools.mapping.align import alignment, moved
+from rs_localizer.tools.mapping.gauge import alignment, moved_map
 
 TURN = so3.exp(np.array([0.4, -0.7, 0.2]))
 
@@ -30,7 +30,7 @@ def room() -> Map:
 
 def test_floor_size_and_origin():
     by = alignment(room(), distance=(4, 9, 1.5), floor=[0, 1, 2, 3], origin=2)
-    found = moved(room(), by)
+    found = moved_map(room(), by)
     np.testing.assert_allclose(found.points[:4, 2], 0.0, atol=1e-12)
     assert np.all(found.points[4:, 2] > 0.0)
     np.testing.assert_allclose(found.points[2], 0.0, atol=1e-12)
@@ -60,7 +60,7 @@ def test_markers():
     other = Marker.at("4x4_50", 5, 0.2, Pose(np.array([1.0, 2.0, 5.0])))
     markers = MarkerMap((replace(hung, deviations=known), other))
     by = alignment(markers, scale=2.0, up=tuple(TURN[:, 1]), origin=3)
-    found = moved(markers, by).markers
+    found = moved_map(markers, by).markers
     np.testing.assert_allclose(found[0].pose.rotation[:, 1], [0.0, 0.0, 1.0], atol=1e-12)
     np.testing.assert_allclose(found[0].pose.position, 0.0, atol=1e-12)
     assert [marker.size for marker in found] == pytest.approx([0.4, 0.4])

@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.markers.maps import MarkerMap, wall
-from rs_localizer.tools.mapping import MappingError
 from rs_localizer.tools.mapping.anchors import Anchors, Distance, PointSight, placement
 from rs_localizer.tools.mapping.gauge import Similarity
 from rs_localizer.tools.mapping.triangulation import Triangulated
@@ -58,7 +57,7 @@ def test_a_marker_that_was_seen_briefly_moves_no_map():
 def test_a_wrong_marker_map_is_refused():
     points = back(WALL.points)
     points[:4] += 0.5
-    with pytest.raises(MappingError, match="do not lie where their map says"):
+    with pytest.raises(ValueError, match="do not lie where their map says"):
         placed(Anchors(WALL), points)
 
 

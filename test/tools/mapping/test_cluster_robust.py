@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from rs_localizer.tools.adjust.cluster_robust import pull_at_landmarks
+from rs_localizer.tools.adjust.fit import pull_at_landmarks
 
 RATE, LANDMARKS, SECONDS = 30, 60, 10
 
@@ -35,7 +35,7 @@ def test_what_errors_pull_at_landmarks_is_their_long_run_variance(share):
         rows = own[of].reshape(-1, 3)
         fit = np.linalg.lstsq(rows, errors[of].ravel(), rcond=None)[0]
         left[of] = errors[of] - (rows @ fit).reshape(-1, 2)
-    pull = pull_at_landmarks(
+    measured, expected = pull_at_landmarks(
         np.concatenate([own, left[..., None]], axis=2), landmarks, times, np.zeros(LANDMARKS)
     )
-    assert pull.measured / pull.expected == pytest.approx((1.0 + share) / (1.0 - share), rel=0.2)
+    assert measured / expected == pytest.approx((1.0 + share) / (1.0 - share), rel=0.2)

@@ -13,7 +13,6 @@ import pytest
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.camera_files import colmap_camera, colmap_parameters
-from rs_localizer.tools.mapping import MappingError
 from rs_localizer.tools.mapping import structure as structures
 from rs_localizer.tools.mapping.refinement import global_errors
 from rs_localizer.tools.mapping.structure import build_structure, image_name, pairs_of
@@ -67,7 +66,7 @@ def test_a_process_that_dies_is_named(tmp_path, monkeypatch):
         "sys.stderr.flush()\nos.abort()\n"
     )
     monkeypatch.setattr(structures, "_SCRIPT", dying)
-    with pytest.raises(MappingError, match=r"ended with signal SIGABRT: free\(\): invalid pointer"):
+    with pytest.raises(ValueError, match=r"ended with signal SIGABRT: free\(\): invalid pointer"):
         build(tmp_path, tmp_path / "out", 3)
 
 

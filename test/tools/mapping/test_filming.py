@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from rs_localizer.features.extraction import Features
+from rs_localizer.tools.mapping.build import comes_back
 from rs_localizer.tools.mapping.map_keypoints import MapObservations
-from rs_localizer.tools.mapping.report import comes_back
-from rs_localizer.tools.mapping.seen_images import SeenImage, choose_keyframes
+from rs_localizer.tools.mapping.structure import SeenImage, choose_keyframes
 
 
 def views_of(sharpnesses: list[float]) -> list[SeenImage]:
