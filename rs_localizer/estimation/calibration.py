@@ -153,15 +153,12 @@ def calibration_effect(
     lens = some.lens_of(exposure.lenses)
     smooth = posterior.shared * smooth_columns_of(by_motion, image, bend, lens)
     rows = np.concatenate([smooth, by_motion, columns], axis=2).reshape(2 * len(rays), -1)
-    every = found / len(rays) * (rows.T @ rows)
-    variance, first = posterior.noise**2, smooth.shape[2]
-    still, of_pose = math.inf, inverted(every[first:, first:][POSE, POSE].copy())
-    if math.isfinite(of_pose[0, 0]):
-        still = longest_axis(posterior.inflation * variance * of_pose[TURN, TURN].copy())
     # Without other frames the covariance has all of what the smooth error does.
-    covariance, left = _effect(
-        every, (first, tracked), of_speeds, terms, state, variance, rotation is not None
-    )
+    covariance, left, still = _effect(
+        rows, found / len(rays), (smooth.shape[2], tracked), of_speeds, terms, state,
+        posterior.noise**2, rotation is not None,
+    )  # fmt: skip
+    still *= math.sqrt(posterior.inflation)
     if not (np.isfinite(covariance).all() and np.isfinite(left).all()):
         return NO_EFFECT._replace(still_deviation=still)
     residual = math.sqrt(max(float(left[:declared].sum()), 0.0) / (2.0 * found))
@@ -170,22 +167,27 @@ def calibration_effect(
 
 @entry
 def _effect(
-    every: Array2, fitted: tuple[int, bool], of_speeds: Array1, terms: PriorTerms, state: Array1,
-    variance: float, turn_known: bool,
-) -> tuple[Array, Array]:  # fmt: skip
+    rows: Array2, weight: float, fitted: tuple[int, bool], of_speeds: Array1, terms: PriorTerms,
+    state: Array1, variance: float, turn_known: bool,
+) -> tuple[Array, Array, float]:  # fmt: skip
     """Return what errors of one deviation do to pose and velocities, and what they leave.
 
     Args:
-        every: (q+18+k,q+18+k) products of the columns of smooth error, motion, and errors.
+        rows: (2n,q+18+k) columns of smooth error, motion, and errors.
+        weight: of their products, for points that are left out.
         fitted: how many columns the smooth error has; and whether it does something beside the
             covariance, too.
         of_speeds: probabilities of typical speeds.
 
     Returns:
-        covariance (12,12) and what no motion takes up (k,), px^2; NaN: nothing is determined.
+        covariance (12,12) and what no motion takes up (k,), px^2, NaN: nothing is determined; and
+        the deviation (rad) of the orientation about the axis known worst if the motion were known.
     """
-    smooth, is_beside = fitted
+    (smooth, is_beside), every, still = fitted, weight * (rows.T @ rows), np.inf
     size, last = len(every), smooth + PARAMETERS
+    of_pose = inverted(every[smooth : smooth + POSE.stop, smooth : smooth + POSE.stop].copy())
+    if np.isfinite(of_pose[0, 0]):
+        still = math.sqrt(variance) * longest_axis(of_pose[TURN, TURN].copy())
     columns = size + smooth if is_beside else size
     whole = np.zeros((columns, columns))
     whole[:size, :size] = every
@@ -205,7 +207,7 @@ def _effect(
     of_motion, of_errors = every[smooth:last, smooth:last].copy(), every[smooth:last, last:].copy()
     taken = alone @ of_errors
     left = np.sum(taken * (of_motion @ taken - 2.0 * of_errors), axis=0)
-    return pull @ pull.T, left + np.diag(every)[last:]
+    return pull @ pull.T, left + np.diag(every)[last:], still
 
 
 def promised(posterior: Posterior) -> float:
