@@ -299,7 +299,7 @@ def calibrate(
     freedom = _freedom(posed.observations, intrinsics)
     fitted = _smooth(posed, stamps.interval, freedom)
     # Times of images and finer knots would follow what a stabilizer does, for minutes.
-    turned = is_turned(fitted, stamps.interval, images)
+    turned = _is_turned(fitted, stamps.interval, images)
     if not turned:
         fitted = _best(posed, stamps.interval, fitted, freedom)
     observations, no_mount = within(posed.observations, fitted.state.spline), ""
@@ -315,16 +315,18 @@ def calibrate(
     )  # fmt: skip
 
 
-def is_turned(fitted: Fit, interval: float, images: list[ImagePoints]) -> bool:
-    """Return whether rows of images rotate otherwise than the images, as of a stabilized film.
-
-    By the shutter that was found, if it is one: shorter than the ``interval`` (s).
-    """
+def _is_turned(fitted: Fit, interval: float, images: list[ImagePoints]) -> bool:
+    """Return :func:`is_turned` by the shutter that was found, if it is one."""
     readout_time, camera = fitted.state.readout_time, fitted.camera
     if not 3.0 * fitted.readout_time_deviation < abs(readout_time) < interval:
         return False
     if readout_time < 0.0:
         camera = replace(camera, scan_direction=REVERSED[ScanDirection(camera.scan_direction)])
+    return is_turned(camera, images)
+
+
+def is_turned(camera: Camera, images: list[ImagePoints]) -> bool:
+    """Return whether rows of images rotate otherwise than the images, as of a stabilized film."""
     tracker = Tracker(Localizer(camera))
     middle_ns = round(-1e9 * camera.readout_time * camera.first_row_time)
     for image in images:
