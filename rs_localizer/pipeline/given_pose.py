@@ -29,6 +29,7 @@ _UNSAID = (0.1, 0.05)
 # Nobody knows a pose better beforehand than it is worth: m, rad.
 _LEAST = (0.01, 0.005)
 _OLDEST = 10.0  # s
+_UNKNOWN = 1e12  # m^2, rad^2: a variance as large says nothing
 _ROUNDING = 1e-6  # of an eigenvalue of correlations: filters compute with single precision
 # Squared distance of six numbers from what was given that one pose in ten thousand has.
 _FAR = 27.9
@@ -74,8 +75,10 @@ def read_given_pose(message: Any) -> GivenPose:
         raise MessageError("the covariance of the given pose holds numbers that are not finite")
     if (variances := spread.diagonal()).min() < 0.0:
         raise MessageError(f"the given pose has variances below zero: {variances.tolist()}")
-    spread = 0.5 * (spread + spread.T)
-    scale = np.sqrt(np.where(variances > 0.0, variances, 1.0))
+    # Some write the largest number there is for what they do not know.
+    shrunk = np.sqrt(_UNKNOWN / np.maximum(variances, _UNKNOWN))
+    spread = np.outer(shrunk, shrunk) * (0.5 * spread + 0.5 * spread.T)
+    scale = np.sqrt(np.where(variances > 0.0, np.minimum(variances, _UNKNOWN), 1.0))
     if (least := np.linalg.eigvalsh(spread / np.outer(scale, scale))[0]) < -_ROUNDING:
         raise MessageError(
             f"the given pose has no covariance: its correlations have an eigenvalue of {least:.2g}"
