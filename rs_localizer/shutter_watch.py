@@ -152,13 +152,13 @@ class _Way(NamedTuple):
     by_stamps: Array  # (3,6) the speed's, by errors of the three stamps
     noise: float  # of the speed, squared
 
-    @property
-    def jump(self) -> Array:
+    def jump(self, before: Array) -> Array:
         """Return the deviation (6,) of the speed of a motion that starts or stops somewhere here.
 
-        At an unknown moment, by the difference of the speeds before and after: uniformly.
+        It does so at an unknown moment. What the speed changes by was not foreseen by the change
+        ``before``, of the frame before.
         """
-        return 0.5 * self.seconds / math.sqrt(12.0) * self.change
+        return 0.5 * self.seconds / math.sqrt(12.0) * (self.change - before)
 
     @classmethod
     def through(cls, before: _Look, now: _Look, after: _Look) -> _Way | None:
@@ -230,6 +230,7 @@ class ShutterWatch:
         self._any = np.diag(spread**2)
         self._mean, self._covariance = np.zeros(_ESTIMATED), self._any
         self._unlike = 1.0  # by how much the square of what wanders is more than usual
+        self._change, self._jump = np.zeros(6), np.zeros(6)  # of the last way
 
     @property
     def rows_turn(self) -> bool:
@@ -303,8 +304,14 @@ class ShutterWatch:
             self._rotations = RowRotations()
             return
         way, now = _Way.through(*self._looks), self._looks[1]
-        if way is not None and len(now.off) >= 2 * now.rows.shape[1]:
-            self._measure(now, way)
+        if way is None:
+            self._change = self._jump = np.zeros(6)
+        elif len(now.off) >= 2 * now.rows.shape[1]:
+            jump = way.jump(self._change)
+            # Between two images it is in the ways about both.
+            widest = max(jump, self._jump, key=np.linalg.norm)
+            self._change, self._jump = way.change, jump
+            self._measure(now, way, widest)
             self._judge(way.seconds)
 
     def _look(self, time_ns: int, found: Estimate, points: Array, pixels: Array) -> _Look:
@@ -326,8 +333,8 @@ class ShutterWatch:
         off = rows[:, 6:12] @ speed - lines.errors[near].ravel()
         return _Look(time_ns, found, units, rows, bent, off)
 
-    def _measure(self, now: _Look, way: _Way) -> None:
-        """Add the evidence of a frame."""
+    def _measure(self, now: _Look, way: _Way, jump: Array) -> None:
+        """Add the evidence of a frame; ``jump`` (6,) is the deviation of its speed."""
         # The noise of poses looks like shaking, and is taken off. In the squared speed it is two
         # variances of a pose over the squared time, in the squared change, as it counts here, 24.
         changes = 0.25 * way.seconds**2 * way.change @ way.change - 12.0 * way.noise
@@ -341,16 +348,16 @@ class ShutterWatch:
         known[_OTHERWISE, _OTHERWISE] += self._unlike * wanders
         prior = self._mean * np.repeat([1.0, _ALIKE, 1.0], [2, 12, 3])
         mean, self._covariance, speed, weights = _measured(
-            now.rows, now.off, prior, known, way.speed, way.by_stamps, way.jump
+            now.rows, now.off, prior, known, way.speed, way.by_stamps, jump
         )
         self._mean = mean
         changed = (mean - prior)[_OTHERWISE] ** 2 / wanders.diagonal()
         more = min(float(np.mean(changed)), _MOST_UNLIKELY * self._unlike) - self._unlike
         self._unlike = max(self._unlike + _LEARNING * more, 1.0)
-        self._compare_rotations(now, way, speed, weights, self._unlike * wanders[:3, :3])
+        self._compare_rotations(now, way, speed, weights, self._unlike * wanders[:3, :3], jump[:3])
 
     def _compare_rotations(
-        self, now: _Look, way: _Way, speed: Array, weights: Array, wandering: Array
+        self, now: _Look, way: _Way, speed: Array, weights: Array, wandering: Array, jump: Array
     ) -> None:
         """Compare the rotation over the rows of a frame with that between frames."""
         design = np.c_[now.rows[:, :9], now.bent]
@@ -364,9 +371,8 @@ class ShutterWatch:
         covariance[:3, :3] += by_stamps.T @ self._covariance[_STAMPS, _STAMPS] @ by_stamps
         shorter = (self._usual * self._shorter) ** 2 * float(speed[:3] @ speed[:3])
         covariance[:3, :3] += wandering + shorter * np.eye(3)
-        jump = np.outer(self._usual * way.jump[:3], self._usual * way.jump[:3])
         # All of the jump may be within the rows.
-        covariance += np.kron(np.diag([1.0, 12.0]), jump)
+        covariance += np.kron(np.diag([1.0, 12.0]), self._usual**2 * np.outer(jump, jump))
         one = RowRotation(turned, covariance, by_shutter)
         self._rotations.add(one, 2.0 * self._usual / way.seconds)
 
