@@ -39,7 +39,7 @@ from rs_localizer.estimation.calibration import (
 )
 from rs_localizer.estimation.hypotheses import Posterior, frame_posterior
 from rs_localizer.estimation.known_rotation import coupled_turn
-from rs_localizer.estimation.left_out import BENT, LeftOut, by_chance, left_out, reordered
+from rs_localizer.estimation.left_out import BENT, SAMPLE, LeftOut, by_chance, left_out, reordered
 from rs_localizer.estimation.moved_part import MovedParts
 from rs_localizer.estimation.points import (
     NEAREST,
@@ -86,6 +86,15 @@ _NOISE = 0.25
 def _is_bent(found: Estimate) -> bool:
     """Return whether errors are smooth beyond what boards of paper have."""
     return found.model_error > BENT * found.declared_error
+
+
+def _straightens(found: Estimate, tracked: Estimate) -> bool:
+    """Return whether a motion is straight by leaving out what bends a track: what creeps away.
+
+    One that only bends to all points does not: before a wrong lens the track has the better one.
+    """
+    left = np.count_nonzero(tracked.inliers & ~found.inliers)
+    return not _is_bent(found) and bool(left > SAMPLE)
 
 
 class Localizer:
@@ -280,8 +289,7 @@ class Localizer:
             if tracked and not _is_bent(tracked):
                 return replace(tracked, tracked=True)
         found = self._searched(observed)
-        # What creeps away may bend a track: a motion that leaves it out is straight.
-        if tracked and (not found or _is_bent(found)):
+        if tracked and not (found and _straightens(found, tracked)):
             return replace(tracked, tracked=True)
         return found
 

@@ -46,7 +46,7 @@ from rs_localizer.estimation.search import GLOBAL_SHUTTER_SCALE, MotionSearch
 
 # So many points have a motion, or a pose, whatever they are; the corners of one marker may be
 # misplaced in the map.
-_SAMPLE, _OF_POSE, _MARKER = 6, 3, 4
+SAMPLE, _OF_POSE, _MARKER = 6, 3, 4
 # Explanations that chance makes in one frame of 1,000 (Desolneux, Moisan and Morel, IJCV 2000: the
 # number of false alarms).
 _LEAST_CHANCE = -math.log(1e-3)
@@ -144,7 +144,7 @@ def left_out(
     most = _BENT_OFF_CENTRE if off_centre(observed.exposure.cameras[0]) else BENT
     bent = posterior.model_error > most * promised(posterior)
     bent |= wide or posterior.noise > EXPECTED_NOISE * threshold
-    second = _own_motion(search, observed, rest, threshold) if left > _SAMPLE else None
+    second = _own_motion(search, observed, rest, threshold) if left > SAMPLE else None
     # Before K errors hang together: some of them over the image, or those of a second group.
     alone = observed.exposure.alone
     if not known and alone and (bent or second is not None):
@@ -267,7 +267,7 @@ def _own_motion(
     own = search.from_rough(part, start)
     group = rest & observations.within(own.state, gate)
     size = int(np.count_nonzero(group))
-    if _surprise(left, size, _SAMPLE, math.pi * gate**2 / area) < _LEAST_CHANCE:
+    if _surprise(left, size, SAMPLE, math.pi * gate**2 / area) < _LEAST_CHANCE:
         return None
     chosen = observations.only(np.flatnonzero(group))
     best = best_motion(chosen.packed, chosen.count, own.state, observed.terms, threshold)
@@ -354,7 +354,7 @@ def _another_lens(
     with the focal length, and both show before a wall, where neither does alone.
     """
     focal, last = observed.assumed.focal_length, WIDEST_GATE * threshold
-    camera, enough = observed.exposure.cameras[0], observed.observations.count - _SAMPLE
+    camera, enough = observed.exposure.cameras[0], observed.observations.count - SAMPLE
     middle = centre_of(camera) / focal if of_size else 0.5 * np.array(camera.size) / focal
     starts: list[tuple[int, float, Array, Array, float]] = []
     for length, scaled in product(_LENGTHS, (True,) if of_size else (False, True)):
@@ -363,7 +363,7 @@ def _another_lens(
         start = search.rough(through)
         errors = through.observations.squared_errors(start.state)
         near = min(int(np.count_nonzero(errors < circle**2)), enough)
-        if start.found and near > _SAMPLE + _LENS:
+        if start.found and near > SAMPLE + _LENS:
             closest = -float(np.median(errors)) if of_size else 0.0
             starts.append((near, closest, start.state, lens, 2.0 * circle))
             if near == enough and not of_size:
@@ -411,7 +411,7 @@ def _step(observed: Observed, state: Array, whitened: Array, off: Array, gate: f
     seen, usable = observed.observations, observed.usable
     lines = linearized(seen.packed, seen.count, state, np.zeros((seen.count, 6)))
     near, size = np.square(lines.errors).sum(axis=1) < gate**2, PARAMETERS + _LENS  # NaN is not
-    if np.count_nonzero(near) < _SAMPLE + _LENS:
+    if np.count_nonzero(near) < SAMPLE + _LENS:
         return np.full(size, np.nan)
     by_ray = usable.by_ray[usable.indices][near]
     by_length = np.einsum("nij,nj->ni", by_ray, lines.image[near])[:, :, None]
