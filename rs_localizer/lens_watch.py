@@ -20,7 +20,6 @@ import numpy as np
 from rs_localizer.config import CalibrationErrors, LocalizerConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lens import off_centre
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure
 from rs_localizer.core.scanning import VERTICAL
@@ -128,10 +127,10 @@ class LensWatch:
     def widened(self, found: Estimate, points: Array, pixels: Array) -> Estimate:
         """Return a frame that allows for another camera matrix, if frames doubt K.
 
-        Pose and twist that the other matrix gives are one deviation away. A wrong focal length
-        scales the distance of a board, its tilt and all ways by one share, and so it does linear
-        and angular velocities. A camera whose fy over fx is off by ``s`` reads that as a pitch rate
-        of ``s`` times the height over the focal length.
+        The pose that the other matrix gives is one deviation away. A wrong focal length scales the
+        distance of a board, its tilt and all ways by one share, and so it does linear and angular
+        velocities. A camera whose fy over fx is off by ``s`` reads that as a pitch rate of ``s``
+        times the height over the focal length.
         """
         if not (self._other and self._exposure and self._together) or self.refusal:
             return found
@@ -156,14 +155,8 @@ class LensWatch:
         there = self._other.find(points, pixels, prior=predicted(motion, covariance))
         if there:
             turn = so3.log(np.ascontiguousarray(found.rotation @ there.rotation.T))
-            off = np.r_[
-                turn, found.rotation @ (there.position - found.position),
-                there.angular_velocity - found.angular_velocity,
-                there.linear_velocity - found.linear_velocity,
-            ]  # fmt: skip
-            calibration += np.outer(off, off)
-            if off_centre(given):  # surely of another image, of which frames tell a part
-                calibration += there.calibration_covariance
+            off = np.r_[turn, found.rotation @ (there.position - found.position)]
+            calibration[POSE, POSE] += np.outer(off, off)
         return replace(found, calibration_covariance=calibration)
 
     def add(
@@ -218,8 +211,7 @@ class LensWatch:
 
     def _allow_other(self, together: FramesTogether) -> None:
         other = together.other
-        config = replace(self._config, calibration=self.calibration)
-        self._other = None if other is None else Localizer(other[0], config)
+        self._other = None if other is None else Localizer(other[0], self._config)
 
     def is_beyond(self, found: Estimate) -> bool:
         """Return whether one frame's smooth error is beyond what is declared."""
