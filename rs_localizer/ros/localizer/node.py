@@ -8,12 +8,9 @@ From message to pose: ``Inputs`` takes a message, ``_take_frame`` passes it to t
 
 import functools
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from typing import Any
 
-from rclpy.clock import ClockChange, JumpThreshold
-from rclpy.duration import Duration
-from rclpy.node import Node
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray  # type: ignore[import-untyped]
@@ -37,6 +34,7 @@ from rs_localizer.ros.localizer.health import (
     of_interest,
     tell,
 )
+from rs_localizer.ros.node.clock import watch_clock
 from rs_localizer.ros.node.conversion import (
     create_output,
     installed,
@@ -126,32 +124,6 @@ class Publisher:
         wanted = list(filter(self._wanted, names))
         for name, message in messages(frame, make_message, wanted).items():
             self._publishers[name].publish(message)
-
-
-# s: a simulation, or a recording that is played, goes on in shorter steps.
-_LONGEST_STEP = 5.0
-
-
-def watch_clock(node: Node, jumped: Callable[[float], None]) -> Any:
-    """Call this with the seconds of each jump of the node's clock; return the handle.
-
-    A simulated clock jumps where a simulation is reset, or another part of a recording is played;
-    not with each of its steps, and not when it is set for the first time.
-    """
-    clock = node.get_clock()
-
-    def tell(change: Any) -> None:
-        step_ns = change.delta.nanoseconds
-        is_first = clock.now().nanoseconds == step_ns
-        if change.clock_change != ClockChange.ROS_TIME_NO_CHANGE or not is_first:
-            jumped(1e-9 * step_ns)
-
-    jumps = JumpThreshold(
-        min_forward=Duration(seconds=_LONGEST_STEP),
-        min_backward=Duration(nanoseconds=-1),
-        on_clock_change=True,
-    )
-    return clock.create_jump_callback(jumps, post_callback=tell)
 
 
 class LocalizerNode(ManagedNode[NodeConfig, Localized]):
