@@ -226,9 +226,9 @@ def colmap_camera(text: str, chosen: str | None) -> Camera:
     if model not in _COLMAP_MODELS:
         raise ValueError(f"model must be one of {', '.join(_COLMAP_MODELS)}; found {model}")
     names, distortion = _COLMAP_MODELS[model]
-    width, height, *numbers = words
-    if len(numbers) != len(names.split()):
+    if len(words) != 2 + len(names.split()):
         raise ValueError(f"{model} has width, height, {names}; found {' '.join(words)}")
+    width, height, *numbers = words
     values = dict(zip(names.split(), map(float, numbers), strict=True))
     fx, fy = (values.get(name, values.get("f", 0.0)) for name in ("fx", "fy"))
     D = [values.get(name, 0.0) for name in _ORDER[distortion]]

@@ -97,6 +97,8 @@ def _camchain(tree: Any) -> RigParts:
     pose = np.eye(4)
     for place, (name, item) in enumerate(tree.items()):
         try:
+            if not isinstance(item, dict):
+                raise ValueError(f"expected a mapping, found {item!r}")
             shutter = {of: item[of] for of in _SHUTTER if of in item}
             cameras[str(name)] = replace(kalibr_camera(item), **shutter)
             if by_imu:

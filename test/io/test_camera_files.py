@@ -115,6 +115,7 @@ def test_one_of_several_cameras(tmp_path):
         (ROS.replace("rational_polynomial", "fov"), r"distortion_model must be .* found 'fov'"),
         (ROS[: ROS.index("distortion_model")], r"no distortion coefficients: is it cut off"),
         (COLMAP.format("FOV", "500 510 321 241 1"), r"model must be one of .* found FOV"),
+        ("1 PINHOLE 640", "PINHOLE has width, height, fx fy cx cy; found 640"),
         (JSON % '"width": 300, "height": 480', r"principal point \(320.5, 240.5\) lies outside"),
         ('<?xml version="1.0"?><opencv_storage/>', "it is XML, which OpenCV's FileStorage writes"),
     ],

@@ -86,6 +86,7 @@ def test_with_an_imu_the_rig_has_its_axes_and_its_clock(tmp_path):
         (CHAIN.replace("camera_model: ds", "camera_model: omni"),
          "cam1: camera_model must be pinhole, eucm or ds, found 'omni'"),
         ("[1, 2]", "a camchain has a mapping for each camera"),
+        ("cam0: 640", "cam0: expected a mapping, found 640"),
     ],
 )  # fmt: skip
 def test_faults_are_named(tmp_path, text, expected):

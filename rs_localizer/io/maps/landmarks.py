@@ -123,8 +123,13 @@ def make_map(
             raise MapError(f"covariances must be ({len(points)},3,3), found {covariances.shape}")
         covariances = np.ascontiguousarray(covariances, dtype=np.float64)
         variances = covariances.diagonal(axis1=1, axis2=2)
-        if np.any(variances < 0.0) or np.any(np.isinf(covariances)):
-            raise MapError("covariances must have finite variances of 0 or more (NaN: not known)")
+        bad = (variances < 0.0).any(axis=1) | np.isinf(covariances).any(axis=(1, 2))
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise MapError(
+                "covariances must have finite variances of 0 or more (NaN: not known), found "
+                f"{variances[row].tolist()} m^2 at index {row}"
+            )
     if error_modes is not None:
         shape, kind = error_modes.shape, error_modes.dtype.kind
         if len(shape) != 3 or shape[:2] != points.shape or kind not in "fiu":
