@@ -46,16 +46,6 @@ def projected(camera: Camera, rays: Array) -> tuple[Array, Array]:
     return camera.distort(rays) if lens is None else _projected(rays, *lens)
 
 
-def seen_at(camera: Camera, points: Array) -> Array:
-    """Return the raw pixels (n,2) of points (n,3), as :meth:`Camera.project` does."""
-    lens = pinhole(camera)
-    if lens is None:
-        return camera.project(points)
-    depth = np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
-    pixels: Array = _projected(points[:, :2] / depth[:, None], *lens)[0]
-    return pixels
-
-
 @lru_cache(64)  # of the cameras of a rig, and lenses that are tried
 def pinhole(camera: Camera) -> tuple[Array, Array, Array] | None:
     """Return focal lengths (2,), centre (2,) in delivered pixels, and coefficients (12,)."""

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rs_localizer.core.bearings import bearings, projected, seen_at
+from rs_localizer.core.bearings import bearings, projected
 from rs_localizer.core.camera import Camera, Roi
 
 K = np.array([[500.0, 0.0, 321.0], [0.0, 510.0, 238.0], [0.0, 0.0, 1.0]])
@@ -105,9 +105,6 @@ def test_kernels_of_many_pixels_and_differences_give_the_same(model, D, part):
         for side in (1e-5, -1e-5)
     )
     np.testing.assert_allclose(lens.pixel_jacobian(rays), (ahead - behind) / 2e-5, atol=1e-3)
-    points = np.column_stack([2.0 * rays, np.full(len(rays), 2.0)])
-    points[7] *= -1.0
-    np.testing.assert_allclose(seen_at(lens, points), lens.project(points), rtol=1e-10, atol=1e-9)
 
 
 def test_what_has_no_bearing_has_none_and_harms_no_neighbour():
