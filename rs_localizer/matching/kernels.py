@@ -195,3 +195,27 @@ def in_view(points: Array2, state: Array1, low: Array1, high: Array1, depths: Ou
         side, up = 0.5 * abs((dx - a * dz) / z), 0.5 * abs((dy - b * dz) / z)
         if low[0] - side < a < high[0] + side and low[1] - up < b < high[1] + up:
             depths[n] = z
+
+
+@entry
+def move(points: Array2, state: Array1, rows: Array1, moved: Out[Array2]) -> None:
+    """Move points (n,3) into the axes of the camera at row times (n,).
+
+    ``exp(-tau [omega]x) (R X + t - tau v)``, the turn about one axis by Rodrigues' formula.
+
+    Args:
+        state: (18,) as of :func:`in_view`.
+    """
+    R, t, w, s = state[:9], state[9:12], state[12:15], state[15:]
+    rate = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    a, b, c = (w[0] / rate, w[1] / rate, w[2] / rate) if rate > 0.0 else (0.0, 0.0, 1.0)
+    for n in range(len(points)):
+        X, Y, Z, tau = points[n, 0], points[n, 1], points[n, 2], rows[n]
+        x = R[0] * X + R[1] * Y + R[2] * Z + t[0] - tau * s[0]
+        y = R[3] * X + R[4] * Y + R[5] * Z + t[1] - tau * s[1]
+        z = R[6] * X + R[7] * Y + R[8] * Z + t[2] - tau * s[2]
+        sine, cosine = np.sin(-tau * rate), np.cos(-tau * rate)
+        along = (1.0 - cosine) * (a * x + b * y + c * z)
+        moved[n, 0] = cosine * x + sine * (b * z - c * y) + along * a
+        moved[n, 1] = cosine * y + sine * (c * x - a * z) + along * b
+        moved[n, 2] = cosine * z + sine * (a * y - b * x) + along * c
