@@ -84,14 +84,14 @@ _NOISE = 0.25
 
 
 def _is_bent(found: Estimate) -> bool:
-    """Return whether errors are smooth beyond what boards of paper have."""
+    """Return whether smooth errors are larger than boards of paper have them."""
     return found.model_error > BENT * found.declared_error
 
 
 def _straightens(found: Estimate, tracked: Estimate) -> bool:
     """Return whether a motion is straight by leaving out what bends a track: what creeps away.
 
-    One that only bends to all points does not: before a wrong lens the track has the better one.
+    A motion that fits all points does not: before a wrong lens the track is the better one.
     """
     left = np.count_nonzero(tracked.inliers & ~found.inliers)
     return not _is_bent(found) and bool(left > SAMPLE)

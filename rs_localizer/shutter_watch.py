@@ -155,8 +155,8 @@ class _Way(NamedTuple):
     def jump(self, before: Array) -> Array:
         """Return the deviation (6,) of the speed of a motion that starts or stops somewhere here.
 
-        It does so at an unknown moment. What the speed changes by was not foreseen by the change
-        ``before``, of the frame before.
+        The moment is unknown. Only the part of the change counts that ``before``, the change at the
+        last frame, does not foresee.
         """
         return 0.5 * self.seconds / math.sqrt(12.0) * (self.change - before)
 

@@ -48,7 +48,7 @@ class Estimate(Motion):
     """
 
     inliers: BoolArray  # (n,)
-    residuals: Array  # (n,) reprojection error in raw pixels, NaN where a point was unusable
+    residuals: Array  # (n,) px raw, reprojection errors, linear about the pixels; NaN: unusable
     joint_covariance: Array  # (18 + 3 k, 18 + 3 k)
     iterations: int  # minimal samples drawn
     # (12,12) part of ``covariance`` that errors of calibration and declared map cause

@@ -131,7 +131,7 @@ class _Case:
 
     @property
     def axes(self) -> list[int]:
-        """Of the six numbers of a pose, those that it has."""
+        """Return which of the six numbers of a pose the transform has."""
         return [0, 1, 5] if self.config.two_d_mode else [0, 1, 2, 3, 4, 5]
 
     @property

@@ -40,7 +40,7 @@ class Rivals:
         self._static: dict[str, str] = {}  # parents of those that are, by child
         self._early: dict[Link, Any] = {}  # static ones, which come once, before we send
         self.static = ""
-        """What contradicts for ever, one sentence; empty: nothing does."""
+        """The contradiction that does not pass, in one sentence; empty: there is none."""
 
     def parent(self, item: Broadcast) -> str:
         """Return the parent that others give this child; its own if nobody does."""
