@@ -32,11 +32,13 @@ FLIGHT = (
 # Numbers that survive any arithmetic: a camera at the front that looks to the left.
 LEFT = Rotation.from_quat([-0.5, -0.5, 0.5, 0.5])
 MOUNTING = Transform(LEFT.as_matrix(), np.array([0.5, 0.25, 0.875]))
-# The node's inputs are best effort, and a busy machine loses messages: here, none may be lost.
+# The node's inputs are best effort, and a busy machine loses messages: here, none may be lost. The
+# readings before the first frame are more than the 200 that wait in a node, and are sent at once.
 RELIABLE = [
     word
     for topic in KINDS
-    for word in ("-p", f"qos_overrides.{topic}.subscription.reliability:=reliable")
+    for policy in ("reliability:=reliable", "depth:=1000")
+    for word in ("-p", f"qos_overrides.{topic}.subscription.{policy}")
 ]
 
 
