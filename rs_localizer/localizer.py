@@ -20,7 +20,13 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure, Rig, RigEstimate
 from rs_localizer.core.rotation_prior import RotationPrior
 from rs_localizer.core.shake import shake_at
-from rs_localizer.core.state import PARAMETERS, POSE, VELOCITIES, step_between
+from rs_localizer.core.state import (
+    MOTION_PARAMETERS,
+    PARAMETERS,
+    POSE,
+    VELOCITIES,
+    step_between,
+)
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.acceptance import (
     estimate_of,
@@ -55,6 +61,7 @@ from rs_localizer.estimation.prior import (
     PriorTerms,
     assumptions,
     knows_motion,
+    knows_speed,
     of_frame,
     state_in,
     unchecked,
@@ -63,6 +70,7 @@ from rs_localizer.estimation.prior import (
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.robust import GATE, WIDEST_GATE, best_motion
 from rs_localizer.estimation.search import Candidate, MotionSearch, generator
+from rs_localizer.estimation.window import step_from
 from rs_localizer.solvers.table import find_solver, start_solver
 
 # A prediction may be wrong by this multiple of the inlier threshold.
@@ -88,13 +96,22 @@ def _is_bent(found: Estimate) -> bool:
     return found.model_error > BENT * found.declared_error
 
 
-def _straightens(found: Estimate, tracked: Estimate) -> bool:
-    """Return whether a motion is straight by leaving out what bends a track: what creeps away.
+def _leaves_out(found: Estimate | Failure, tracked: Estimate) -> bool:
+    """Return whether a motion leaves out what bends a track: what creeps away.
 
     A motion that fits all points does not: before a wrong lens the track is the better one.
     """
-    left = np.count_nonzero(tracked.inliers & ~found.inliers)
-    return not _is_bent(found) and bool(left > SAMPLE)
+    return bool(found and np.count_nonzero(tracked.inliers & ~found.inliers) > SAMPLE)
+
+
+def _or_else(found: Estimate, tracked: Estimate) -> Estimate:
+    """Return a motion that allows for a track of which nobody knows how fast it is.
+
+    Either the camera has gone farther, or a wrong lens shows it so.
+    """
+    step = step_from(found, tracked)[:MOTION_PARAMETERS]
+    moment = found.calibration_covariance + np.outer(step, step)
+    return replace(found, calibration_covariance=moment)
 
 
 class Localizer:
@@ -289,9 +306,14 @@ class Localizer:
             if tracked and not _is_bent(tracked):
                 return replace(tracked, tracked=True)
         found = self._searched(observed)
-        if tracked and not (found and _straightens(found, tracked)):
-            return replace(tracked, tracked=True)
-        return found
+        if not tracked or prior is None:
+            return found
+        if found and not _is_bent(found):
+            if _leaves_out(found, tracked):
+                return found
+            if not knows_speed(observed.terms, prior):
+                return _or_else(found, tracked)
+        return replace(tracked, tracked=True)
 
     def _searched(self, observed: Observed) -> Estimate | Failure:
         # 3. A global-shutter start, then hypotheses of the solver (LO-RANSAC).

@@ -79,9 +79,9 @@ _MOST_INNOVATION = 62.0
 # Of the logarithm of the odds of a vibration, the part that the next frame has of it: sizes and
 # spectra last for thirty frames, in which a motor is seen that no frame shows.
 _REMEMBERED = 0.97
-# How fast a camera may be that a track begins with, in configured deviations: who hardly turns is
-# taken for slow by one image, and may be a car.
-_FAST = 2.0
+# How fast a camera may be that one image takes for slow, in configured deviations: it hardly turns,
+# and may be in an aircraft.
+_FAST = 20.0
 # Covariance of a motion that is only a first guess.
 _UNKNOWN = np.diag(np.full(PARAMETERS, np.inf))
 # The least acceleration that a configuration may have, rad/s^2 and m/s^2.
@@ -507,6 +507,10 @@ class Tracker:
         if not found or not (self.remembers_motion or self.aid is not None):
             return None
         known = self.localizer.known_of(prior if found.tracked else None, found.span, rotation)
+        if not found.tracked:
+            found, informations = self._at_any_speed(found), known.informations.copy()
+            informations[0, LINEAR] = 0.0
+            known = known._replace(informations=informations)
         try:
             return told_of(found, time_ns, known, rotation)
         except np.linalg.LinAlgError:
@@ -677,10 +681,18 @@ class Tracker:
             # behind is no Gaussian's. NaN, of rounding errors, is neither.
             if -1.0 < window.surprise < _MOST_INNOVATION:
                 return window
-        config, start = self.localizer.config, gaussian_of(result, time_ns)
-        start.covariance[LINEAR, LINEAR] += (_FAST * config.velocity_prior.linear) ** 2 * np.eye(3)
-        alone = MotionWindow.begin(start, config.acceleration, share)
+        start = gaussian_of(self._at_any_speed(result), time_ns)
+        alone = MotionWindow.begin(start, self.localizer.config.acceleration, share)
         return alone if track is None else replace(alone, deviations=track.window.deviations)
+
+    def _at_any_speed(self, result: Estimate) -> Estimate:
+        """Return the motion of one image, which may be faster if its rows do not show how fast."""
+        if result.twist_known:
+            return result
+        faster = _FAST * self.localizer.config.velocity_prior.linear * result.span
+        joint = result.joint_covariance.copy()
+        joint[LINEAR, LINEAR] += faster**2 * np.eye(3)
+        return replace(result, joint_covariance=joint)
 
     def _beside_aid(self, track: _Track) -> Acceleration:
         """Return the accelerations beside the rotation that an aid reads."""

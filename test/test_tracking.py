@@ -13,6 +13,7 @@ import rs_localizer as rsl
 from benchmarks.frames.conditions import TRACKED, Condition
 from benchmarks.frames.conditions import moving as shaking
 from benchmarks.frames.judged import judge
+from benchmarks.independent.cameras import Camera
 from benchmarks.independent.scenes import Rich
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import project_rolling
@@ -207,6 +208,49 @@ def test_poses_and_twists_at_any_time_are_covered():
     inside = np.mean(np.array(lengths) < INSIDE_6, axis=0)
     assert np.all(inside > 0.8), inside
     assert np.all(np.median(lengths, axis=0) > 0.3)  # and not far too wide
+
+
+def test_between_rare_images_a_shaken_hand_may_have_swung():
+    """Five images a second of what swings once to five times, and their rows show no speed."""
+    rng, true, lengths = np.random.default_rng(3), replace(PLAIN, readout_time=0.006), []
+    rates, phases = 2.0 * np.pi * np.stack([rng.uniform(1.0, 5.0, (8, 6)), rng.random((8, 6))])
+
+    def shaken(t):
+        swings = np.sin(rates * t[..., None] + phases).sum(axis=1) / 2.0
+        return Rotation.from_rotvec(0.05 * swings[:, :3]), 0.02 * swings[:, 3:]
+
+    hand, tracker = Moving(shaken, true), Tracker(rsl.Localizer(camera_of(true)))
+    for k, t in enumerate(0.2 * np.arange(30)):
+        assert tracker.localize(ns(t), *hand.frame(t, MAP, 120, 0.5, seed=k))
+        if k > 1:
+            lengths.append([off_at(tracker, t - 0.2 * ago, hand)[0] for ago in (0.1, 0.3, 0.5)])
+    assert np.mean(np.array(lengths) < INSIDE_6) > 0.8
+    assert np.max(lengths) < 2.0 * FAR
+
+
+@pytest.mark.parametrize(
+    ("height", "speed", "rate"), [(300.0, 50.0, 10.0), (1000.0, 50.0, 1.2), (2.0, 0.3, 30.0)]
+)
+def test_an_aircraft_is_as_fast_as_its_images_show(height, speed, rate):
+    """The first image takes it for slow; others show how far it has gone."""
+    rng, true = np.random.default_rng(0), Camera(1280, 960, 1000.0, readout_time=0.02)
+    ground = rng.uniform(-1.0, 1.0, (4000, 3)) * [height, height, 0.1 * height]
+    ground[:, 0] += speed * 4.0 / rate
+
+    def flying(t):
+        down = Rotation.from_rotvec([0.0, np.pi, 0.0]) * Rotation.from_rotvec(
+            0.03 * np.sin(np.array([2.1, 1.1, 1.7]) * t)
+        )
+        return down, np.array([speed, 0.0, 0.0]) * t + np.array([0.0, 0.0, height])
+
+    aircraft, tracker = Moving(flying, true), Tracker(rsl.Localizer(camera_of(true)))
+    for k, t in enumerate(np.arange(8) / rate):
+        found = tracker.localize(ns(t), *aircraft.frame(t, ground, 300, 0.5, seed=k))
+        assert found, str(found)
+        error = aircraft.error(found, t)
+        assert squared(error[:6], found.covariance) < FAR
+        if k:
+            assert squared(error[6:], found.covariance[6:, 6:]) < FAR
 
 
 def test_predictions_are_as_sure_as_a_real_hand_lets_them_be():

@@ -304,6 +304,12 @@ def knows_motion(prior: Prior) -> bool:
     return prior.covariance is not None and not np.isinf(np.diagonal(prior.covariance)).all()
 
 
+def knows_speed(terms: PriorTerms, prior: Prior) -> bool:
+    """Return True if a prior knows the linear velocity better than the terms do."""
+    default = np.diagonal(terms.informations[0])[LINEAR]
+    return bool(np.all(np.diagonal(np.asarray(prior.covariance))[LINEAR] * default < 1.0))
+
+
 def with_motion(
     terms: PriorTerms, prior: Prior, centre: Array, turn_known: bool = False
 ) -> PriorTerms:
@@ -316,9 +322,12 @@ def with_motion(
         return terms
     covariance = np.ascontiguousarray(prior.covariance, np.float64)
     if len(covariance) == PARAMETERS:  # it knows the accelerations better than a default
+        better = knows_speed(terms, prior)
         terms = terms._replace(informations=terms.informations.copy())
         terms.informations[0, ACCELERATIONS] = 0.0
-        if turn_known:
+        if better:  # a default may be that of slower cameras
+            terms.informations[0] = 0.0
+        elif turn_known:
             terms.informations[0][_TURNING] = 0.0
     information = _information_of(covariance)
     return _with_term(terms, information, state_in(prior.motion, centre), pivot_of(covariance))

@@ -24,8 +24,8 @@ accelerations that last.
 The motion is a mixture, weighed as that of one frame (docs/estimator.md). Who rests may start
 before a scale can be learnt anew: in the last transitions accelerations are those that were learnt,
 or three or ten times as large. A hand that images see once or thrice a second has turned back
-between them: velocities in images may also differ from the trajectory's, by deviations of four
-sizes.
+between them: velocities in images may also differ from the trajectory's, by deviations of five
+sizes, and poses between images by what that makes.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ _LEAST_SCALE, _MOST_SCALE = 0.03, 100.0
 _GROWN, _ODDS, _RECENT = (3.0, 10.0), math.log(20.0), 3
 # Deviations of velocities in images from the trajectory's, over configured accelerations times the
 # time between images, if that (s) is longer: below, they change no twist of hands nor of a phone.
-_SWINGS, _SLOW = (0.01, 0.03, 0.1, 0.3), 0.15
+_SWINGS, _SLOW = (0.01, 0.03, 0.1, 0.3, 1.0), 0.15
 # Who turns about one axis turns a little about the others: of the largest deviation.
 _LEAST_SHARE = 0.3
 # Derivatives of a motion without its vibration by motion and coefficients.
@@ -161,8 +161,10 @@ class _Swinging(NamedTuple):
     evidence: float  # logarithm of the factor of their likelihood
 
     @classmethod
-    def of(cls, states: Array, own: tuple[Array, Array], deviations: Array) -> _Swinging:
-        """Let velocities differ by deviations (n,4)."""
+    def of(
+        cls, states: Array, own: tuple[Array, Array], deviations: Array, away: Array
+    ) -> _Swinging:
+        """Let velocities differ by deviations (n,4), and poses by these times ``away`` (n,), s."""
         informations, gradients = own
         precisions, spreads = deviations[:, _OF_AXES] ** -2.0, np.zeros_like(informations)
         inner = informations[:, VELOCITIES, VELOCITIES] + precisions[:, :, None] * np.eye(6)
@@ -171,6 +173,7 @@ class _Swinging(NamedTuple):
         pulled = np.einsum("nij,nj->ni", across, gradients)
         evidence = np.log(precisions).sum() - np.linalg.slogdet(inner)[1].sum()
         evidence += np.einsum("ni,nij,nj->", gradients, spreads, gradients)
+        spreads[:, POSE, POSE] = (away[:, None] ** 2 / precisions)[:, :, None] * np.eye(6)
         told = informations - across @ informations, gradients - pulled
         return cls(states, own, told, spreads, 0.5 * float(evidence))
 
@@ -327,10 +330,24 @@ class MotionWindow:
         found = [solved(told, self.deviations, rounds, 1.0)]
         learnt = found[0].deviations
         found += [solved(told, learnt, 0, grown) for grown in _GROWN]
-        for swing in _SWINGS if np.median(seconds) > _SLOW else ():
-            beside = _Swinging.of(states, told, swing * np.outer(seconds, self.configured))
+        apart, away = _between(seconds, informations)
+        for swing in _SWINGS if np.median(apart) > _SLOW else ():
+            beside = _Swinging.of(states, told, swing * np.outer(apart, self.configured), away)
             found.append(beside.of_images(solved(beside.told, learnt, 0, 1.0)))
         return tuple(found)
+
+
+def _between(seconds: Array, informations: Array) -> tuple[Array, Array]:
+    """Return times (n,) between images, of steps between samples, and how far one is from them.
+
+    A sample that tells nothing lies between two images. The slowest swing that neither shows has a
+    half of its period between them, and is away by its velocity times this time (n,), s.
+    """
+    apart, away = seconds.copy(), np.zeros(len(seconds))
+    for k in np.flatnonzero(~informations.any(axis=(1, 2))):
+        apart[k : k + 2] = whole = seconds[k] + seconds[k + 1]
+        away[k] = whole / math.pi * math.sin(math.pi * seconds[k] / whole)
+    return apart, away
 
 
 @entry
