@@ -127,10 +127,10 @@ class LensWatch:
     def widened(self, found: Estimate, points: Array, pixels: Array) -> Estimate:
         """Return a frame that allows for another camera matrix, if frames doubt K.
 
-        The pose that the other matrix gives is one deviation away. A wrong focal length scales the
-        distance of a board, its tilt and all ways by one share, and so it does linear and angular
-        velocities. A camera whose fy over fx is off by ``s`` reads that as a pitch rate of ``s``
-        times the height over the focal length.
+        The motion that the other matrix gives is one deviation away. A wrong focal length scales
+        the distance of a board, its tilt and all ways by one share, and so it does linear and
+        angular velocities. A camera whose fy over fx is off by ``s`` reads that as a pitch rate of
+        ``s`` times the height over the focal length.
         """
         if not (self._other and self._exposure and self._together) or self.refusal:
             return found
@@ -155,8 +155,12 @@ class LensWatch:
         there = self._other.find(points, pixels, prior=predicted(motion, covariance))
         if there:
             turn = so3.log(np.ascontiguousarray(found.rotation @ there.rotation.T))
-            off = np.r_[turn, found.rotation @ (there.position - found.position)]
-            calibration[POSE, POSE] += np.outer(off, off)
+            off = np.r_[
+                turn, found.rotation @ (there.position - found.position),
+                there.angular_velocity - found.angular_velocity,
+                there.linear_velocity - found.linear_velocity,
+            ]  # fmt: skip
+            calibration += np.outer(off, off)
         return replace(found, calibration_covariance=calibration)
 
     def add(
@@ -169,7 +173,7 @@ class LensWatch:
         """
         if jumped and not self._jumped:  # who jumps on and on is seen wrongly, not moved
             self._posed.clear()
-        self._jumped = jumped
+        self._jumped = jumped or (self._jumped and len(self._posed) < FRAMES)
         if not found:
             self._others.append(found.detail if found.reason is Reason.CALIBRATION else "")
             return

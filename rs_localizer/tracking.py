@@ -190,7 +190,7 @@ class Tracker:
         for each in (self._integrity, self._parts, self.shutter, self.lens):
             each.reset()
         self.cameras = CamerasTogether(self.localizer.rig, self.localizer.config)
-        self._allowing = self.localizer  # for a camera matrix that frames doubt
+        self._allow(self.lens.calibration)
         if self.aid is not None:
             self.aid.reset()
 

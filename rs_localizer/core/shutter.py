@@ -27,7 +27,7 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, Array1, Array2
 from rs_localizer.core.blocks import add_block
-from rs_localizer.core.camera import Camera
+from rs_localizer.core.camera import Camera, numbers
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.native import entry
 
@@ -54,7 +54,10 @@ class Motion:
 
     def at_rows(self, tau: Array) -> tuple[Array, Array]:
         """Return the rotations (n,3,3) and translations (n,3) camera_from_map at row times (n,)."""
-        return _at_rows(numbers_of(self), np.ascontiguousarray(tau, np.float64))
+        rows = numbers("tau", tau, np.ascontiguousarray)
+        if rows.ndim != 1:
+            raise ValueError(f"tau must be row times of shape (n,), got {rows.shape}")
+        return _at_rows(numbers_of(self), rows)
 
     def angle_at(self, tau: Any) -> Array:
         """Return the rotation vector (3,), rad, from the middle row to ``tau``."""

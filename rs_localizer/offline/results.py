@@ -7,7 +7,6 @@ Frames are written as they come; of each, some numbers stay (250 bytes).
 
 from __future__ import annotations
 
-import itertools
 import textwrap
 import time
 from array import array
@@ -309,8 +308,8 @@ def summary(tally: Tally, config: NodeConfig, out: Path, timed: bool = True) -> 
             ("  vibrating, left as they were", smoothed.shaken),
         ]
     lines = [f"{name:40} {text!s:>8}" for name, text in rows]
-    said = tally.details.items(), ((name, text) for name, (_, text) in tally.notices.items())
-    for name, text in itertools.chain(*said):
+    said: dict[str, str] = {**tally.details, **({} if tally.aid is None else tally.aid.details)}
+    for name, text in (said | {name: text for name, (_, text) in tally.notices.items()}).items():
         lines += textwrap.wrap(f"{name}: {text}", _WIDTH, subsequent_indent="    ")
     if (fault := readout_fault(config.readout_time, tally.period)) is not None:
         lines.append(f"warning: {fault}")

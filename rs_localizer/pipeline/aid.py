@@ -56,6 +56,7 @@ class AidState:
     share: float  # of the last frames
     mostly: Unused | None  # most frequent of the last frames; None: it was used in all
     reasons: dict[ImuReason, int]  # frames that went without, by reason
+    details: dict[ImuReason, str]  # the latest of each, one sentence
     rate: float  # Hz; NaN: unknown
     time_offset: float  # s to be added to its stamps, in all; NaN: unknown
     status: InertialStatus | None  # what the frames say of the gyroscope
@@ -140,6 +141,7 @@ class AidInput:
         self._with_force = 0  # how many
         self._gravity: float | None = None
         self._reasons: Counter[ImuReason] = Counter()
+        self._details: dict[ImuReason, str] = {}
         self._in_a_row: deque[ImuReason] = deque(maxlen=_LONG)
         self._reported: ImuReason | None = None
         self._odd = 0  # frames in a row that say what the gyroscope has
@@ -174,6 +176,7 @@ class AidInput:
             recently.count(None) / len(recently),
             next((u for u in reversed(recently) if u is not None and u.reason == usual), None),
             dict(self._reasons),
+            dict(self._details),
             self._buffer.rate(),
             self._given_offset + estimated,
             self._status,
@@ -279,6 +282,7 @@ class AidInput:
             self._reported = None
             return
         self._reasons[unused.reason] += 1
+        self._details[unused.reason] = unused.detail
         self._in_a_row.append(unused.reason)
         if self._in_a_row.count(unused.reason) == _LONG and self._reported != unused.reason:
             self._reported = unused.reason

@@ -67,6 +67,8 @@ def test_velocities_are_the_derivatives_of_the_poses(shaken):
     for pose, tau in zip(zip(*estimate.at_rows(rows), strict=True), rows, strict=True):
         np.testing.assert_allclose(pose[0], estimate.at(tau)[0], atol=1e-12)
         np.testing.assert_allclose(pose[1], estimate.at(tau)[1], atol=1e-12)
+    with pytest.raises(ValueError, match=r"row times of shape \(n,\), got \(1, 3\)"):
+        estimate.at_rows(rows[None])
 
 
 def apart(one, other):

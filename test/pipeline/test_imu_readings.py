@@ -25,6 +25,7 @@ from rs_localizer.io.outputs import Localized
 from rs_localizer.io.trajectories import read_motions
 from rs_localizer.io.transforms import TransformError, TransformTree
 from rs_localizer.offline.replay import imu_first
+from rs_localizer.offline.results import Tally, summary
 from rs_localizer.pipeline.aid import in_camera_axes
 from rs_localizer.pipeline.camera_frames import CameraFrames, Refusal
 
@@ -167,6 +168,8 @@ def test_the_camera_goes_on_alone(flight, fault):
     assert flown.state.reasons[reason] > 0
     lasts = fault not in ("is cut", "begins late")
     assert flown.notices[reason] == lasts  # told once, not at every frame
+    told = summary(Tally(0, {}, aid=flown.state), NodeConfig(), Path("out"), timed=False)
+    assert any(line.startswith(f"{reason}: ") for line in told)
 
 
 def test_a_wrong_mounting_is_noticed(flight):
