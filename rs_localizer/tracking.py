@@ -507,7 +507,7 @@ class Tracker:
         if not found or not (self.remembers_motion or self.aid is not None):
             return None
         known = self.localizer.known_of(prior if found.tracked else None, found.span, rotation)
-        if not found.tracked:
+        if not (found.tracked or found.twist_known):
             found, informations = self._at_any_speed(found), known.informations.copy()
             informations[0, LINEAR] = 0.0
             known = known._replace(informations=informations)
@@ -681,14 +681,12 @@ class Tracker:
             # behind is no Gaussian's. NaN, of rounding errors, is neither.
             if -1.0 < window.surprise < _MOST_INNOVATION:
                 return window
-        start = gaussian_of(self._at_any_speed(result), time_ns)
+        start = gaussian_of(result if result.twist_known else self._at_any_speed(result), time_ns)
         alone = MotionWindow.begin(start, self.localizer.config.acceleration, share)
         return alone if track is None else replace(alone, deviations=track.window.deviations)
 
     def _at_any_speed(self, result: Estimate) -> Estimate:
-        """Return the motion of one image, which may be faster if its rows do not show how fast."""
-        if result.twist_known:
-            return result
+        """Return the motion of one image whose rows do not show how fast the camera is."""
         faster = _FAST * self.localizer.config.velocity_prior.linear * result.span
         joint = result.joint_covariance.copy()
         joint[LINEAR, LINEAR] += faster**2 * np.eye(3)

