@@ -56,7 +56,7 @@ class PaceWatch:
 
     @property
     def fault(self) -> str:
-        """What the poses show, in one sentence; '': nothing."""
+        """How the poses contradict one camera in metres, in one sentence."""
         return self._scale or (self._apart if self._returned >= _ALTERNATING else "")
 
     def returns(self, is_back: bool, away: Array) -> None:

@@ -508,25 +508,28 @@ class Tracker:
         Returns:
             what was found, the prior that it was found with, and what its points tell.
         """
-        found: Estimate | Failure | None = None
+        aided: tuple[Estimate | Failure, Prior | None, MotionSample | None] | None = None
         if foreseen is not None and self.aid is not None and not self.aid.contradicted:
             rotation = foreseen.rotation
             prior = foreseen.prior or self._prior(time_ns, rotation, span, context)
             found = find(prior, rotation)
             told = self._told(time_ns, found, prior, rotation)
+            aided = found, prior, told
             # Far from where it was expected, a frame before a plane agrees with any rotation.
             free = foreseen.prior is None or foreseen.prior.motion is None
             if found and told is not None and (free or found.tracked):
                 if self.aid.agrees(foreseen, found, told):
-                    return found, prior, told
+                    return aided
                 foreseen = None  # and is judged
         alone = self._prior(time_ns, None, span, context)
         other = find(alone, None)
-        if not other and found is not None:
-            return found, prior, told
+        if not other and aided is not None:
+            return aided
         told = self._told(time_ns, other, alone, None)
         if other and told is not None and foreseen is not None and self.aid is not None:
-            self.aid.agrees(foreseen, other, told)
+            agrees = self.aid.agrees(foreseen, other, told)
+            if agrees and aided is not None and aided[0] and aided[2] is not None:
+                return aided
         return other, alone, told
 
     def _told(
