@@ -114,6 +114,25 @@ def _or_else(found: Estimate, tracked: Estimate) -> Estimate:
     return replace(found, calibration_covariance=moment)
 
 
+def _contradiction(found: Estimate, prior: Prior) -> str:
+    """Return by how much measurements differ from what points show that fit without them."""
+    off = []
+    if prior.gravity is not None:
+        down = np.asarray(prior.gravity, float)
+        seen = found.rotation @ np.asarray(prior.gravity_in_map, float)
+        angle = math.atan2(float(np.linalg.norm(np.cross(down, seen))), float(down @ seen))
+        off.append((angle, "gravity", "rad", prior.gravity_deviation))
+    if prior.angular_velocity is not None:
+        rate = math.dist(found.angular_velocity, np.asarray(prior.angular_velocity, float))
+        off.append((rate, "angular_velocity", "rad a readout", prior.angular_velocity_deviation))
+    said = (f"{x:.2g} {unit} off {name}, given to {given:.2g}" for x, name, unit, given in off)
+    return (
+        f"{np.count_nonzero(found.inliers)} points fit without the prior's measurements, and not "
+        f"with them: their motion is {' and '.join(said)}. Are these in camera axes, of this sign "
+        "and unit?"
+    )
+
+
 class Localizer:
     """Rolling-shutter absolute pose of single frames.
 
@@ -211,9 +230,15 @@ class Localizer:
                 f"refinement {self.config.refinement} knows the points alone: neither a prior nor "
                 "a rotation"
             )
-        return self.accepted(
+        found = self.accepted(
             self.find(points, pixels, scores, prior, expected_share, rotation, stamps)
         )
+        measured = prior is not None and not (prior.gravity is prior.angular_velocity is None)
+        if prior is not None and measured and (not found or _is_bent(found)):
+            alone = self.localize(points, pixels, scores, rotation=rotation, stamps=stamps)
+            if alone and not _is_bent(alone):
+                return Failure(Reason.PRIOR, _contradiction(alone, prior))
+        return found
 
     def accepted(self, found: Estimate | Failure) -> Estimate | Failure:
         """Return the estimate, or a :class:`Failure` if its orientation is too uncertain."""

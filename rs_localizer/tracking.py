@@ -60,6 +60,7 @@ from rs_localizer.estimation.window import (
 from rs_localizer.integrity import Integrity
 from rs_localizer.lens_watch import LensWatch
 from rs_localizer.localizer import Localizer
+from rs_localizer.pace_watch import PaceWatch
 from rs_localizer.repeated_images import RepeatedImages, is_clear
 from rs_localizer.shutter_watch import FAR_OFF, ShutterWatch
 from rs_localizer.solvers.table import find_solver
@@ -84,6 +85,8 @@ _REMEMBERED = 0.97
 _FAST = 20.0
 # Covariance of a motion that is only a first guess.
 _UNKNOWN = np.diag(np.full(PARAMETERS, np.inf))
+# A frame that jumped is back where the one before the last was if it is nearer to it by this.
+_BACK = 0.5
 # The least acceleration that a configuration may have, rad/s^2 and m/s^2.
 _LEAST_ACCELERATION = 0.001
 
@@ -170,6 +173,7 @@ class Tracker:
         is_watched = rolls and not others
         self.shutter = ShutterWatch(camera if is_watched else None, config.inlier_threshold)
         self.lens = LensWatch(rig.exposure().ahead() if is_watched else None, config)
+        self.pace = PaceWatch(config)
         self._integrity = Integrity(config.acceleration)
         self._parts = MovedParts(config.map_deviation)
         self._last_ns: int | None = None
@@ -187,7 +191,7 @@ class Tracker:
         self._seen.clear()
         self._images = RepeatedImages()
         self.repeats = False  # whether the last frame shows an image that had come before
-        for each in (self._integrity, self._parts, self.shutter, self.lens):
+        for each in (self._integrity, self._parts, self.shutter, self.lens, self.pace):
             each.reset()
         self.cameras = CamerasTogether(self.localizer.rig, self.localizer.config)
         self._allow(self.lens.calibration)
@@ -432,15 +436,8 @@ class Tracker:
             foreseen = self.aid.foresee(readings, time_ns, self._before(time_ns))
         result, prior, told = self._fitted(time_ns, foreseen, span, context, find)
         if pixels is not None:  # of a camera alone
-            jumped = self._has_jumped(time_ns, prior, result)
             seen = np.asarray(points, float), np.asarray(pixels, float)
-            self.lens.add(time_ns, result, *seen, jumped=jumped)
-            self._allow(self.lens.calibration)
-            if self.lens.matrix is None:
-                self.shutter.add(time_ns, result, *seen, jumped=jumped)
-            doubtful = self.shutter.error or not self.shutter.trusted
-            if doubtful and self.remembers_motion:  # alone, frames may have any velocities
-                self._parts.discard()
+            self._watch(time_ns, result, prior, *seen, scores)
         elif result and self.remembers_motion and isinstance(points, Mapping):
             terms = self.localizer.known_of(None, result.span)
             self.cameras.add(result, terms, points, stamps)
@@ -457,6 +454,42 @@ class Tracker:
         self._images.add(time_ns, points, pixels)
         self._publish()
         return self.delayed
+
+    def _watch(
+        self, time_ns: int, result: Estimate | Failure, prior: Prior | None, points: Array,
+        pixels: Array, scores: ArrayLike | None,
+    ) -> None:  # fmt: skip
+        """Compare a frame of a camera alone with the last ones."""
+        jumped = self._has_jumped(time_ns, prior, result)
+        if result:
+            self._compare_pace(time_ns, result, jumped, points, pixels, scores)
+        if self.pace.fault:  # neighbours are of two cameras, or in another unit
+            self.lens.reset()
+        else:
+            self.lens.add(time_ns, result, points, pixels, jumped=jumped)
+        self._allow(self.lens.calibration)
+        if self.lens.matrix is None:
+            self.shutter.add(time_ns, result, points, pixels, jumped=jumped)
+        doubtful = self.shutter.error or not self.shutter.trusted
+        if doubtful and self.remembers_motion:  # alone, frames may have any velocities
+            self._parts.discard()
+
+    def _compare_pace(self, time_ns: int, result: Estimate, jumped: bool, *frame: Any) -> None:
+        if self._track is not None:
+            away = step_from(self._track.estimate, result)[POSE]
+            before = self._seen[-2].found if len(self._seen) > 1 else None
+            back = step_from(before, result)[POSE] if before else away
+            is_back = jumped and np.linalg.norm(back) < _BACK * np.linalg.norm(away)
+            self.pace.returns(bool(is_back), away)
+
+        def alone() -> Estimate | Failure:
+            if not result.tracked:
+                return result
+            if not (self.lens.is_beyond(result) or self.pace.is_odd):
+                return Failure(Reason.AWAITS_FRAMES, "")
+            return self.localizer.localize(*frame)
+
+        self.pace.add(time_ns, result, frame[0], alone)
 
     def _allow(self, calibration: CalibrationErrors) -> None:
         """Let the next frames have these deviations."""
@@ -475,25 +508,28 @@ class Tracker:
         Returns:
             what was found, the prior that it was found with, and what its points tell.
         """
-        found: Estimate | Failure | None = None
+        aided: tuple[Estimate | Failure, Prior | None, MotionSample | None] | None = None
         if foreseen is not None and self.aid is not None and not self.aid.contradicted:
             rotation = foreseen.rotation
             prior = foreseen.prior or self._prior(time_ns, rotation, span, context)
             found = find(prior, rotation)
             told = self._told(time_ns, found, prior, rotation)
+            aided = found, prior, told
             # Far from where it was expected, a frame before a plane agrees with any rotation.
             free = foreseen.prior is None or foreseen.prior.motion is None
             if found and told is not None and (free or found.tracked):
                 if self.aid.agrees(foreseen, found, told):
-                    return found, prior, told
+                    return aided
                 foreseen = None  # and is judged
         alone = self._prior(time_ns, None, span, context)
         other = find(alone, None)
-        if not other and found is not None:
-            return found, prior, told
+        if not other and aided is not None:
+            return aided
         told = self._told(time_ns, other, alone, None)
         if other and told is not None and foreseen is not None and self.aid is not None:
-            self.aid.agrees(foreseen, other, told)
+            agrees = self.aid.agrees(foreseen, other, told)
+            if agrees and aided is not None and aided[0] and aided[2] is not None:
+                return aided
         return other, alone, told
 
     def _told(

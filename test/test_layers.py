@@ -20,7 +20,7 @@ TRACED = ("core/simd/tracing.py",)
 # What each part may import besides itself; every part has a row.
 METHOD = {
     *("core", "config", "solvers", "estimation", "inertial", "integrity", "localizer"),
-    *("lens_watch", "repeated_images", "shutter_watch", "tracking"),
+    *("lens_watch", "pace_watch", "repeated_images", "shutter_watch", "tracking"),
 }
 MAY_IMPORT: dict[str, set[str]] = {
     "process": set(),
@@ -34,6 +34,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "localizer": {"core", "config", "solvers", "estimation"},
     "integrity": {"core", "config", "estimation", "native"},
     "repeated_images": {"core", "estimation"},
+    "pace_watch": {"core", "config"},
     "lens_watch": {"core", "config", "estimation", "localizer"},
     "shutter_watch": {"core", "estimation", "native"},
     "tracking": METHOD - {"tracking", "inertial"},

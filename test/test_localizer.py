@@ -286,6 +286,19 @@ def test_a_landmark_that_is_matched_wrongly_again_and_again_is_one_witness():
         assert np.mean(found.inliers == np.repeat(right, 3)) > 0.97
 
 
+def test_gravity_that_contradicts_the_points_is_named():
+    points, pixels, _ = frame(Path(1), noise=0.3)
+    localizer = rsl.Localizer(camera())
+    down = localizer.localize(points, pixels).rotation @ [0.0, 0.0, -1.0]
+    across = np.cross(down, [1.0, 0.0, 0.3])
+    wrong = rsl.Prior(gravity=across, gravity_deviation=1e-3)
+    failure = localizer.localize(points, pixels, prior=wrong)
+    assert failure.reason == rsl.Reason.PRIOR
+    assert "1.6 rad off gravity, given to 0.001" in failure.detail
+    right = rsl.Prior(gravity=down, gravity_deviation=0.02)
+    assert localizer.localize(points, pixels, prior=right)
+
+
 def test_what_users_mistake_is_named():
     points, pixels, _ = frame(Path())
     localizer = rsl.Localizer(camera(), inlier_threshold=3.0)

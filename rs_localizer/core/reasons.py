@@ -20,6 +20,7 @@ class Reason(StrEnum):
     MODEL_ERROR = "model_error"
     CALIBRATION = "calibration"
     UNCERTAIN = "uncertain"
+    PRIOR = "prior"
     SCAN_AXIS = "scan_axis"
     AWAITS_FRAMES = "awaits_frames"
     NO_CAMERA_INFO = "no_camera_info"

@@ -308,8 +308,9 @@ def summary(tally: Tally, config: NodeConfig, out: Path, timed: bool = True) -> 
             ("  vibrating, left as they were", smoothed.shaken),
         ]
     lines = [f"{name:40} {text!s:>8}" for name, text in rows]
-    said: dict[str, str] = {**tally.details, **({} if tally.aid is None else tally.aid.details)}
-    for name, text in (said | {name: text for name, (_, text) in tally.notices.items()}).items():
+    said = [*tally.details.items(), *(() if tally.aid is None else tally.aid.details.items())]
+    noticed = [(name, text) for name, (_, text) in tally.notices.items()]
+    for name, text in dict[str, str]([*said, *noticed]).items():
         lines += textwrap.wrap(f"{name}: {text}", _WIDTH, subsequent_indent="    ")
     if (fault := readout_fault(config.readout_time, tally.period)) is not None:
         lines.append(f"warning: {fault}")

@@ -83,7 +83,6 @@ class CameraFrames(FrameLocalizer):
         self._waiting: dict[int, tuple[Correspondences, PublishedMoment]] = {}
         # The newest of them that has a pose, without its rows.
         self._newest: Correspondences | None = None
-        self._scale_is_odd = False  # whether poses say, or soon may say, so of the map
         self._faults: set[str] = set()  # of the shutter, which have been noticed
 
     @property
@@ -189,9 +188,8 @@ class CameraFrames(FrameLocalizer):
         if result and result.aided and not shown:  # the readings, and no row, show its motion
             moment = moment._replace(motion=tracker.turned(moment.stamp_ns, readings))
         if result:
-            self._scale_is_odd = self._stream.pace(
-                time_ns, result, cloud.points, self._config, lambda: self._alone(cloud, result)
-            )
+            if tracker.pace.fault:
+                self._notice(tracker.pace.notice, tracker.pace.fault)
             self._pose_prior.judge_result(result)
             if self.predicts:
                 self._newest = replace(cloud, table=cloud.table[:0], dropped=0)
@@ -214,15 +212,6 @@ class CameraFrames(FrameLocalizer):
             lambda: what_fits.what_fits(tracker.localizer, cloud.points, cloud.pixels),
         )
 
-    def _alone(self, cloud: Correspondences, result: Estimate) -> Estimate | Failure:
-        """Return the pose of a frame that the frames before do not hold, if they may do so."""
-        tracker = self._tracker
-        if not result.tracked:
-            return result
-        if not (tracker.lens.is_beyond(result) or self._scale_is_odd):
-            return Failure(Reason.AWAITS_FRAMES, "")
-        return tracker.localizer.localize(cloud.points, cloud.pixels, cloud.scores)
-
     def _expect(self, time_ns: int, map_frame: str) -> None:
         """Tell the tracker what others know of the pose at a time, if it knows nothing itself."""
         if not (self.calibrations and self._pose_prior.given):
@@ -238,14 +227,14 @@ class CameraFrames(FrameLocalizer):
     ) -> Localized | Refusal:
         """Return a result of the body at the published moment."""
         # A part of the map that lies elsewhere leaves smooth errors, too.
-        if self._tracker.lens.fault and not (self._scale_is_odd or self._tracker.moved):
+        if self._tracker.lens.fault and not (self._tracker.pace.is_odd or self._tracker.moved):
             self._notice(Notice.LENS, self._tracker.lens.fault)
         if not result:
             return Refusal(result.reason, result.detail)
         if result.integrity > DOUBTFUL:
             text = f"pose or map are wrong with a probability of {result.integrity:.0%}"
             self._notice(Notice.DOUBTFUL, text)
-        elif not self._scale_is_odd:  # which also looks like a moved part of the map
+        elif not self._tracker.pace.is_odd:  # which also looks like a moved part of the map
             names = () if self._tags is None else self._tags.names
             gone = stale_landmarks(cloud, self._tracker.stale(cloud.points), names)
             moved = moved_landmarks(cloud, self._tracker.moved, names)

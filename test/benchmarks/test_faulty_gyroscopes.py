@@ -9,11 +9,13 @@ benchmarks.faulty_gyroscopes``.
 import numpy as np
 import pytest
 
-from benchmarks.aided import record
+from benchmarks.aided import believed, record
 from benchmarks.faulty_gyroscopes import FAULTS, followed
 from benchmarks.independent.cameras import Camera
 from benchmarks.independent.motions import hand
 from benchmarks.independent.scenes import Wall
+from rs_localizer.localizer import Localizer
+from rs_localizer.tracking import Tracker
 
 SEED = 3
 
@@ -48,3 +50,14 @@ def test_a_gyroscope_is_never_worse_than_none(fault, said, alone):
         assert found.used > 0.95
         assert np.median(found.rate) < 0.2 * np.median(alone.rate)
     assert found.said == said
+
+
+def test_the_first_image_after_a_gap_is_aided():
+    """Half a second after the last one a wall is seen where no track expected it."""
+    recorded = record(Camera(), hand, Wall(), (1, 40), 2)
+    frames, tracker = recorded.frames, Tracker(Localizer(believed(Camera())), recorded.aid())
+    for frame in (*range(12), 27):
+        seen, readings = frames.seen(frame, 0.3), recorded.around(frame)
+        found = tracker.localize(frames.middle_ns(frame), *seen, readings=readings)
+        assert found.aided
+    assert not found.tracked
