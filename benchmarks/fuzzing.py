@@ -440,7 +440,7 @@ class _Localizer:
         if self._landmarks is None:
             node.localize(self._good)  # so that the other one is tracked
             return node.localize(message)
-        node.use_map(read_map(self._landmarks))
+        node.landmarks.use_map(read_map(self._landmarks))
         node.localize_keypoints(self._good)
         return node.localize_keypoints(message)
 

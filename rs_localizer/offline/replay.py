@@ -387,7 +387,8 @@ def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterato
     last: Item | None = None
     for last in messages:
         topic, recorded_ns, message = last
-        localizer.take_zero_for_time(recorded_ns)
+        # A stamp of 0 is a time where a recording has its message at 0, too.
+        localizer.stream.zero_is_time = recorded_ns == 0
         for result in _each(inputs[topic].take_message(localizer, message)):
             yield answer(recorded_ns, message, result)
     for result in localizer.flush():

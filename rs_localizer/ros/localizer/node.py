@@ -94,7 +94,7 @@ class Publisher:
             self._broadcaster.publish(frame)
         self._map_view.show(frame.map_frame, frames.map_points)
         if camera is not None and self._wanted(topics.CAMERA_MARKER):
-            marker = MarkerArray(markers=[camera_marker(frame, camera.view_corners)])
+            marker = MarkerArray(markers=[camera_marker(frame, camera.camera)])
             self._publishers[topics.CAMERA_MARKER].publish(marker)
         if math.isfinite(frame.estimate.integrity) and self._wanted(topics.INTEGRITY):
             self._publishers[topics.INTEGRITY].publish(integrity_message(frame))
@@ -292,12 +292,12 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
     # -- in the worker's thread --------------------------------------------------------------
 
     def _use(self, frames: FrameLocalizer, item: Input, content: Any) -> None:
-        before = frames.map
+        before = frames.landmarks.map
         try:
             item.use(frames, content)
         except MessageError as error:
             self.refusals.add(item.refused, str(error))
-        if frames.map is not before:
+        if frames.landmarks.map is not before:
             self._say_map(frames)
 
     def _change(self, frames: FrameLocalizer, config: NodeConfig) -> None:
@@ -307,8 +307,8 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
             self.get_logger().info("new settings: the previous frames are forgotten")
 
     def _say_map(self, frames: FrameLocalizer) -> None:
-        if frames.map is not None:
-            count, frame = len(frames.map), frames.map.frame
+        if frames.landmarks.map is not None:
+            count, frame = len(frames.landmarks.map), frames.landmarks.map.frame
             self.get_logger().info(f"the map has {count} landmarks in frame {frame!r}")
 
     # -- what it says of itself --------------------------------------------------------------

@@ -123,7 +123,7 @@ def _frames(structure: Structure, camera: Camera) -> CameraFrames:
     frames = CameraFrames(config)
     frames.calibrate(read_camera_info(make_camera_info(camera, 0)))
     points = structure.start.points
-    frames.use_map(Map(points, np.arange(len(points)), structure.descriptors, MAP_FRAME))
+    frames.landmarks.use_map(Map(points, np.arange(len(points)), structure.descriptors, MAP_FRAME))
     return frames
 
 
