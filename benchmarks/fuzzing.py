@@ -8,8 +8,6 @@ Each target damages right input, reads it, and may raise its own errors only; th
 moment. The exit code is 1 when something fails.
 """
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import gzip

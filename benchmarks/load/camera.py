@@ -5,8 +5,6 @@
 It does as a camera does, at a steady rate and whatever becomes of it.
 """
 
-from __future__ import annotations
-
 import pickle
 import sys
 import time

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Videos of chessboards: corners, cached, and a lens by OpenCV."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

@@ -6,8 +6,6 @@ The content of a file tells which program wrote it. Of several cameras in a file
 a ``#``: ``camchain.yaml#cam1``.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 from collections.abc import Iterator, Mapping

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Offline detection: images -> a recording of correspondences or keypoints, as the nodes do."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field

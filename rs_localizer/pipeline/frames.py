@@ -8,8 +8,6 @@ camera and a rig share stands here; ``CameraFrames`` and ``RigFrames`` localize.
 ``base_frame``.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 

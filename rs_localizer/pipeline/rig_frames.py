@@ -10,8 +10,6 @@ ahead of the others, or has gone back alone. When all clocks go back, a recordin
 :class:`RigFrames` localizes the frames.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """How an IMU goes with the camera: offset of its stamps, rotation and gyroscope bias."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

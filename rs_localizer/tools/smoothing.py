@@ -9,8 +9,6 @@ The accelerations of an estimate are too small, as far as the prior took the pla
 keypoints do not tell; and their squares are the sum of as many numbers only as these do tell.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Words on a calibration: the accepted readout time, and the quality of the lens."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 

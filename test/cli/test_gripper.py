@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A hand-held gripper with a camera: videos of a room and of demonstrations -> trajectories."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from types import SimpleNamespace

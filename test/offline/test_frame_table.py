@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The table of frames: one row a frame, the same bytes whoever makes it."""
 
-from __future__ import annotations
-
 import pickle
 import subprocess
 import sys

@@ -11,8 +11,6 @@
 4. All landmarks are triangulated with that motion, and so is what gives the map its metres.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
