@@ -6,6 +6,7 @@ From message to pose: ``Inputs`` takes a message, ``_take_frame`` passes it to t
     keeps the newest one. ``FrameLocalizer`` localizes it, and ``Publisher`` publishes the result.
 """
 
+import contextlib
 import functools
 import math
 from collections.abc import Collection
@@ -257,7 +258,8 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
             return
         if self._needs_tf and self._frames.aid.frame != self._frames.camera_frame:
             self._needs_tf = False
-            self._broadcaster.tf.listen("the IMU")
+            with contextlib.suppress(ValueError):  # the IMU is not used then, and that is said
+                self._broadcaster.tf.listen("the IMU")
 
     def _take_state(self, item: Input, message: Any) -> None:
         """Read here what the worker uses, so that a bad message does not replace a good one."""
