@@ -5,8 +5,6 @@
 This is the only place that names them all.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

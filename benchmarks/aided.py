@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings of the independent simulator with an IMU, as the package takes them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -9,8 +9,6 @@ is too fast, turned on its mount, late, its stamps step, or its range ends. Erro
 the frames behind the first five, beside those of the camera alone on the same frames.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Sequence

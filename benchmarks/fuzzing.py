@@ -8,8 +8,6 @@ Each target damages right input, reads it, and may raise its own errors only; th
 moment. The exit code is 1 when something fails.
 """
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import gzip
@@ -440,7 +438,7 @@ class _Localizer:
         if self._landmarks is None:
             node.localize(self._good)  # so that the other one is tracked
             return node.localize(message)
-        node.use_map(read_map(self._landmarks))
+        node.landmarks.use_map(read_map(self._landmarks))
         node.localize_keypoints(self._good)
         return node.localize_keypoints(message)
 

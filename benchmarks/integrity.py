@@ -18,8 +18,6 @@ board in an empty view (right, or jumping). Weights are fitted to the first thre
     python -m benchmarks.integrity --fit                         # prints new ones
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import math

@@ -16,8 +16,6 @@ refusals).
 together, and in how many of them something is said.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections import Counter

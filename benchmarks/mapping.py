@@ -5,8 +5,6 @@
 python -m benchmarks.mapping bend surveys walks
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext

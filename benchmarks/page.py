@@ -7,8 +7,6 @@ after ``<!-- NAME -->`` are filled with these files, and it links to those witho
 a name all blocks are filled anew.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

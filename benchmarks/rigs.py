@@ -6,8 +6,6 @@ Tracked recordings of the independent simulator, of rigs of which one camera is 
 when it is said to be; poses beyond five deviations, and what is said.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections import Counter

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Published readout times of cameras: from the first row to the last, ``height - 1`` line times."""
 
-from __future__ import annotations
-
 import csv
 import difflib
 from dataclasses import asdict, dataclass

@@ -44,7 +44,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "matching": {"core", "config", "estimation", "io", "native"},
     "markers": {"core", "io", "native"},
     "features": {"core", "config", "io"},
-    "pipeline": {*METHOD, "io", "features", "markers", "matching"},
+    "pipeline": {*METHOD, "io", "features", "markers", "matching", "settings"},
     "offline": {*METHOD, *"io features markers matching pipeline process settings".split()},
 }
 # What makes a camera or a map known: nothing but the commands imports it.

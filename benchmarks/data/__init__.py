@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings that benchmarks use; each folder beside this has an ATTRIBUTION.md."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from rs_localizer import data

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """How many iterations the solvers need: the paper's Fig. 3."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

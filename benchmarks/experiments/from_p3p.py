@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """All solvers from the orientation that P3P finds: the paper's Fig. 5."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

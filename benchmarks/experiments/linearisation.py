@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors when the initial orientation is off: how far linearised rotations reach."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from benchmarks.experiments import methods as m

@@ -7,8 +7,6 @@ is taken, as a robust loop would. P3P alone gets the best of all triplets of the
 the paper: the pose whose orientation is nearest to the truth, which no real method could pick.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations

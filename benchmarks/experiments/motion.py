@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors while the camera moves faster and faster."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors under pixel noise, how near they come to the bound, and what six points can see."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables, figures and claims of an experiment, and how they are written."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence

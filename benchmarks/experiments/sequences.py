@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inliers of plain RANSAC with each solver on a real phone: the paper's Fig. 6."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -5,8 +5,6 @@
 Of frames: ``python -m benchmarks.frames times``.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import NamedTuple

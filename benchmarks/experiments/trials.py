@@ -8,8 +8,6 @@ direction, and moves at a constant velocity of any direction during the readout.
 exact. A frame lasts one readout.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache

@@ -7,8 +7,6 @@ Another version of the package is judged by the same benches from any other fold
     cd /tmp; PYTHONPATH=/path/to/other/version:/path/to/this python -m benchmarks.frames run ...
 """
 
-from __future__ import annotations
-
 import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: one core, as in a node

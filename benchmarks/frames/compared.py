@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two versions on the same frames: what is certainly better or worse."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Iterable, Mapping, Sequence

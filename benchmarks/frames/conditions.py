@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The benches: tables of conditions, and nothing else."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial

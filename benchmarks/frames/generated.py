@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames of a condition: points, pixels and the truth, the same for the same seed."""
 
-from __future__ import annotations
-
 import math
 import zlib
 from collections.abc import Iterator

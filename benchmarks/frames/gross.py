@@ -7,8 +7,6 @@ a hand-held camera; its focal length is off by 0.5 to 2, a binning or ROI counte
 the map was moved. Nothing of the package makes the frames.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

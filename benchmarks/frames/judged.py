@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Conditions through the public interfaces of the package, and the figures of each."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Mapping

@@ -6,8 +6,6 @@ Some conditions of each bench, others that show what benches have not, and frame
 should refuse, or should not; then two recorded boards and a phone.
 """
 
-from __future__ import annotations
-
 import math
 import time
 import zlib

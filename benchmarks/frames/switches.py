@@ -6,8 +6,6 @@ Only here, by changing attributes of its modules: the package has no such switch
 compiled with what they call, so that a switch is a Python function that a kernel is called from.
 """
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What frames cost beside global-shutter estimates of PoseLib and fastpose; and the gate of CI."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import itertools

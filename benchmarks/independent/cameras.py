@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A pinhole camera with Brown's distortion (``plumb_bob``) and a rolling shutter."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum

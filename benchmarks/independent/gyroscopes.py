@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a gyroscope and an accelerometer beside the camera show of its motion."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ The rotation vector of a camera and its place both are sums of sines in time plu
 that may stop, so pose, velocities and accelerations are known exactly at every instant.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cameras that are mounted to one moving body, each with a shutter and a clock of its own."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

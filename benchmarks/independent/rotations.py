@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rotation vectors and matrices; every function takes any number of leading dimensions."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the cameras see: points all around, walls, small planes, boards and markers."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ Publisher, node and measuring subscriber are processes of their own on this mach
 is 0 if the figures meet the limits (on a quiet machine of two cores), else 1.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 

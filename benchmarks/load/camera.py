@@ -5,8 +5,6 @@
 It does as a camera does, at a steady rate and whatever becomes of it.
 """
 
-from __future__ import annotations
-
 import pickle
 import sys
 import time
@@ -24,6 +22,7 @@ from sensor_msgs.msg import CameraInfo, Imu, PointCloud2
 
 from benchmarks.data import HAND_MOTION
 from rs_localizer.core import camera as core
+from rs_localizer.io.imu import make_reading
 from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info, make_correspondences
 from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, IMU, POSE
 from rs_localizer.io.trajectories import read_tum
@@ -31,7 +30,7 @@ from rs_localizer.ros.node.conversion import copy_message
 from rs_localizer.settings import NODE_NAME
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import simulate_frames
-from rs_localizer.tools.simulation.simulated_imu import ImuSettings, Lever, make_imu, simulate_imu
+from rs_localizer.tools.simulation.simulated_imu import ImuSettings, Lever, simulate_imu
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
 
@@ -114,9 +113,9 @@ def _readings(rate: float, seconds: float) -> list[Any]:
     track = simulate_imu(motion, settings, lever, np.random.default_rng(0))
     first = int(np.searchsorted(track.times_ns, motion.intervals_ns[0][0]))
     return [
-        make_imu(
+        make_reading(
             int(track.times_ns[i]), track.angular_velocities[i], track.specific_forces[i],
-            settings, CAMERA_FRAME,
+            CAMERA_FRAME, settings.variances,
         )
         for i in range(first, first + round(seconds * rate))
     ]  # fmt: skip

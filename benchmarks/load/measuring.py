@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Live nodes under load, in processes of their own, and what is heard of them."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pickle

@@ -8,8 +8,6 @@ FOLDER holds videos and ``index.csv``, a line for each: file, inner corners, sid
 as ``walk.mp4,8x6,0.025``. Settings of the method as everywhere: ``-p map_deviation:=0.0005``.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import sys

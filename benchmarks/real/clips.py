@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Videos of chessboards: corners, cached, and a lens by OpenCV."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math
@@ -139,7 +137,7 @@ def _calibrated(clip: Clip) -> dict[str, object]:
     except ValueError as error:
         return {"readout_time": 0.0, "direction": "", "verdict": f"none: {error}"}
     value = f"{1e3 * found.readout_time:+.2f} +- {1e3 * found.deviation:.2f} ms"
-    refusal = verdict.refusal(found)
+    refusal = verdict.lens_refusal(found) or found.disbelief
     return {
         "readout_time": 0.0 if refusal else verdict.readout_time(found),
         "direction": str(verdict.scan_direction(found)),

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the poses of one video say of themselves: nobody knows the truth."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections import Counter

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Estimators that others use: one pose per image, no shutter. OpenCV, and PoseLib by its wheel."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec

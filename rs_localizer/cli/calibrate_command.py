@@ -131,8 +131,10 @@ def run(options: Options) -> Mapping[str, object]:
         frames = {name: frame for name, (_, frame) in cameras.items()}
         _mount(options, sources, found, config, frames)
         return {name: _figures(each) for name, each in found.items()}
-    refusal = verdict.refusal(found[""])
-    if out is not None and not verdict.lens_refusal(found[""]):
+    if refusal := verdict.lens_refusal(found[""]):
+        raise ValueError(refusal)
+    refusal = found[""].disbelief
+    if out is not None:
         refusal = _write(cameras[""][0], out, found[""], sources[""], config, refusal)
     if refusal:
         raise ValueError(refusal)
@@ -247,13 +249,13 @@ def _write(
             "readout_time_deviation": found.deviation,
             "scan_direction": verdict.scan_direction(found),
         }
-        if found.mount is not None and found.mount.time_offset_determined:
+        if found.mount is not None and found.mount.determined[0]:
             values["imu.time_offset"] = found.mount.time_offset + config.stamp_offset
     if config.stamp_offset:
         values["stamp_offset"] = config.stamp_offset
     writers = Writers()
     if marker_map is not None:
-        if free := verdict.shape_is_free(found):
+        if free := found.fit.freedom.landmarks > 0.0:  # of the map's shape
             places = verdict.moved(found, marker_map.points)
             marker_map = marker_map.with_points(places, found.shape_deviation)
         if free or shape is None:
@@ -311,7 +313,8 @@ def _mount(
     config: NodeConfig, frames: Mapping[str, str],
 ) -> None:  # fmt: skip
     """Find how cameras that are calibrated are mounted on a rig, print it and write it."""
-    if refusals := [f"{n}: {text}" for n, one in found.items() if (text := verdict.refusal(one))]:
+    said = {name: verdict.lens_refusal(one) or one.disbelief for name, one in found.items()}
+    if refusals := [f"{name}: {text}" for name, text in said.items() if text]:
         raise ValueError("; ".join(refusals))
     rig, comments = calibrate_rig(found), list[str]()
     first, *others = rig

@@ -183,24 +183,20 @@ def _chosen(given: Sequence[str]) -> tuple[str, Sequence[str]]:
         print(_listed(of_group))
         raise SystemExit(0 if len(words) > 1 else 2)
     if not words:
-        _top_parser().parse_args(before)
+        parser = Parser(
+            prog="rs_localizer",
+            usage="rs_localizer COMMAND ...",
+            description="Position, orientation and velocity of a rolling-shutter camera.",
+            epilog=f"commands:\n{_listed(COMMANDS)}\n\nrs_localizer COMMAND --help says more.",
+        )
+        version = f"rs_localizer {rs_localizer.__version__}"
+        parser.add_argument("--version", action="version", version=version)
+        add_options(parser, CommonOptions)
+        parser.parse_args(before)
         raise UsageError(f"give a COMMAND{MORE}")
     name = " ".join(words[:2]) if of_group else words[0]
     known = of_group or list(dict.fromkeys(each.split()[0] for each in COMMANDS))
     raise UsageError(f"there is no command {name!r}{meant(name, known, 'choose from')}{MORE}")
-
-
-def _top_parser() -> Parser:
-    parser = Parser(
-        prog="rs_localizer",
-        usage="rs_localizer COMMAND ...",
-        description="Position, orientation and velocity of a rolling-shutter camera.",
-        epilog=f"commands:\n{_listed(COMMANDS)}\n\nrs_localizer COMMAND --help says more.",
-    )
-    version = f"rs_localizer {rs_localizer.__version__}"
-    parser.add_argument("--version", action="version", version=version)
-    add_options(parser, CommonOptions)
-    return parser
 
 
 def _listed(names: Iterable[str]) -> str:

@@ -238,7 +238,9 @@ def _replay_all(options: Options) -> None:
     print(f"written to {out / fleet.SUMMARY}")
     done = [task for task in tasks if not isinstance(outcomes[task.folder], str)]
     if options.parquet is not None:
-        tables = [frame_table.read_parquet(task.folder / TABLE) for task in done]
+        from pyarrow.parquet import read_table
+
+        tables = [read_table(task.folder / TABLE) for task in done]
         print(frame_table.write_parquet(tables, options.parquet))
     if failed := len(tasks) - len(done):
         raise ValueError(

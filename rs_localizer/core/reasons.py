@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Names of what users are told: THE lists. docs/reasons.md says what each means and what to do."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
 

@@ -11,8 +11,6 @@ The poses include accelerations, and vibration as far as it is known. A pixel al
 determine the depth; for distant points only the rotation counts.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -6,8 +6,6 @@ The estimator counts time in readouts and has its poses as ``camera_from_map``, 
 Users mostly want the camera in the map, rad/s and m/s.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

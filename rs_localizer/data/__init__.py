@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings that come with the package; each folder has an ATTRIBUTION.md."""
 
-from __future__ import annotations
-
 from importlib.resources import files
 from pathlib import Path
 

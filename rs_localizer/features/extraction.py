@@ -123,10 +123,6 @@ def _root(descriptors: NDArray[Any]) -> Descriptors:
     return roots.astype(np.uint8)
 
 
-def _sift(_: int) -> Any:
-    return cv2.SIFT.create(contrastThreshold=_SIFT_CONTRAST)
-
-
 def _orb(count: int) -> Any:
     return cv2.ORB.create(
         _CHOICE * count,
@@ -160,10 +156,13 @@ def _orb_place(image: Gray, keypoints: Sequence[Any]) -> Array:
 
 
 _METHODS: dict[str, _Method] = {
-    FeatureKind.SIFT: _Method(_sift, False, lambda _, found: _points(found) + _SIFT_OFFSET),
+    FeatureKind.SIFT: _Method(
+        lambda _: cv2.SIFT.create(contrastThreshold=_SIFT_CONTRAST), False,
+        lambda _, found: _points(found) + _SIFT_OFFSET,
+    ),
     FeatureKind.ORB: _Method(_orb, False, _orb_place),
     FeatureKind.AKAZE: _Method(_akaze, True, lambda _, found: _points(found)),
-}
+}  # fmt: skip
 
 
 def kind_of(landmarks: Map) -> str:

@@ -6,8 +6,6 @@ The content of a file tells which program wrote it. Of several cameras in a file
 a ``#``: ``camchain.yaml#cam1``.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 from collections.abc import Iterator, Mapping
@@ -99,11 +97,17 @@ def _camera(text: str, chosen: str | None) -> Camera:
     lines = (line for line in text.splitlines() if line.strip() and not line.startswith("#"))
     if _LINE.match(next(lines, "")) is not None:
         return colmap_camera(text, chosen)
-    tree = _load_tree(text)
+    if text.lstrip()[:1] == "<":
+        raise YamlError("it is XML, which OpenCV's FileStorage writes as .yaml or .json, too")
+    tree = load_yaml(_TAG.sub("", _DIRECTIVE.sub("", text)))
     tree = tree if isinstance(tree, dict) else {}
     blocks = (block for _, block in parameter_blocks(tree) if isinstance(block, dict))
     tree = next((block[LENS] for block in blocks if LENS in block), tree)
-    cameras = {name: item for name, item in tree.items() if _is_camera(item)}
+    own = {"camera_matrix", "image_width"}  # of one of the cameras of ``calibrate --rig``
+    cameras = {
+        name: item for name, item in tree.items()
+        if isinstance(item, dict) and (own <= set(item) or _is_kalibr(item))
+    }  # fmt: skip
     if cameras:
         tree = _choose(cameras, chosen)
     elif chosen is not None:
@@ -136,13 +140,6 @@ def _choose(cameras: Mapping[str, Any], name: str | None) -> Any:
 # are plain mappings of rows, cols, dt and data.
 _DIRECTIVE = re.compile(r"\A%YAML[: ][0-9.]+\s*\n")
 _TAG = re.compile(r"!!opencv[-_a-z]*")
-
-
-def _load_tree(text: str) -> Any:
-    """Return mappings, lists and plain values of a file's text; YamlError for anything else."""
-    if text.lstrip()[:1] == "<":
-        raise YamlError("it is XML, which OpenCV's FileStorage writes as .yaml or .json, too")
-    return load_yaml(_TAG.sub("", _DIRECTIVE.sub("", text)))
 
 
 def _gyroflow_camera(tree: dict[str, Any]) -> Camera:
@@ -272,14 +269,8 @@ _KALIBR_LENSES = ("radtan", "equidistant", "none")
 _KALIBR_SPHERES = (str(DistortionModel.EUCM), str(DistortionModel.DOUBLE_SPHERE))
 
 
-def _is_kalibr(tree: Any) -> bool:
-    return isinstance(tree, dict) and {"camera_model", "intrinsics", "resolution"} <= set(tree)
-
-
-def _is_camera(item: Any) -> bool:
-    """Return True for one of several cameras, of Kalibr's file or of ``calibrate --rig``."""
-    ours = isinstance(item, dict) and {"camera_matrix", "image_width"} <= set(item)
-    return ours or _is_kalibr(item)
+def _is_kalibr(tree: dict[Any, Any]) -> bool:
+    return {"camera_model", "intrinsics", "resolution"} <= set(tree)
 
 
 def kalibr_camera(tree: dict[str, Any]) -> Camera:

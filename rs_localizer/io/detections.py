@@ -8,8 +8,6 @@ corner of the first pixel is at 0, 0 (here: its centre), and the corners of an u
 left, lower right, upper right, upper left (here: clockwise from the upper left).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

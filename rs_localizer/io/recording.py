@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, Roi
 from rs_localizer.io import topics
-from rs_localizer.io.bags import BagWriter, make_message
+from rs_localizer.io.bags import make_message
 from rs_localizer.io.clouds import make_cloud, make_rows
 from rs_localizer.io.messages import make_header
 
@@ -31,20 +31,6 @@ MAP = "map.npz"
 
 # Single precision is what RViz shows and most trackers give: 3e-5 px at the rim of an image.
 _ROW = [*((name, "<f4") for name in "xyzuv"), ("id", "<u4")]
-
-
-def write_frame(
-    bag: BagWriter,
-    camera: Camera,
-    stamp_ns: int,
-    points: Array,
-    pixels: Array,
-    ids: NDArray[np.int64],
-) -> None:
-    """Write camera info and correspondences of an image: points (n,3), pixels (n,2), ids (n,)."""
-    bag.write(CAMERA_INFO_TOPIC, make_camera_info(camera, stamp_ns), stamp_ns)
-    cloud = make_correspondences(stamp_ns, points, pixels, ids)
-    bag.write(CORRESPONDENCES_TOPIC, cloud, stamp_ns)
 
 
 def make_correspondences(

@@ -15,8 +15,6 @@ or any other; besides what Kalibr writes, each may have ``readout_time`` (s) and
 =====================  =================================================================
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Offline detection: images -> a recording of correspondences or keypoints, as the nodes do."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -107,7 +105,8 @@ def record_markers(
         if len(detected.detections.ids):
             corners = correspondences(detected, make_message)
             _write(bag, shot, CORRESPONDENCES_TOPIC, corners, options)
-        if found.images == _PATIENCE and tally.are_few:
+        # So few may show another board in part.
+        if found.images == _PATIENCE and len(found.counts) < _FEW * found.images:
             count = len(found.counts) or "none"
             tell(f"{count} of the first {_PATIENCE} images {tally.nothing()}")
     if not found.counts:
@@ -198,11 +197,6 @@ class _MarkerTally:
         before, self._before = self._before, now
         moved = [now[point] - before[point] for point in now.keys() & before.keys()]
         return float(np.sqrt(np.mean(np.sum(np.square(moved), axis=1)))) if moved else np.inf
-
-    @property
-    def are_few(self) -> bool:
-        """True if so few images show anything that it may be another board, seen in part."""
-        return len(self._found.counts) < _FEW * self._found.images
 
     def nothing(self) -> str:
         """Describe images that show nothing of the map."""

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Many recordings: one function, mapped over them here or by Dask; finished ones are skipped."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import io

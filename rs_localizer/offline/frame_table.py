@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -110,7 +109,9 @@ class FrameTable:
         assert calibration is not None  # without one there is no frame
         camera = calibration.camera(config.readout_time, config.scan_direction)
         middle_ns = middle_row_ns(config, camera, frame.input_stamp_ns)
-        first, last = exposed_rows(camera)
+        width, height = camera.size
+        tau = camera.row_time(np.array([[0.0, 0.0], [width - 1.0, height - 1.0]]))
+        first, last = sorted(tau.tolist())
         of_estimate = 0.0
         if self._smoothed and config.readout_time > 0.0:
             of_estimate = (middle_ns - frame.stamp_ns) * 1e-9 / config.readout_time
@@ -135,13 +136,6 @@ class FrameTable:
 
         self._flush()
         return pa.Table.from_batches(self._batches, self._schema).sort_by("stamp_ns")
-
-
-def exposed_rows(camera: Camera) -> tuple[float, float]:
-    """Return the row times of the first and last exposed row of the delivered image."""
-    width, height = camera.size
-    times = camera.row_time(np.array([[0.0, 0.0], [width - 1.0, height - 1.0]]))
-    return float(times.min()), float(times.max())
 
 
 def _as_json(camera: Camera, exposed: list[float]) -> str:
@@ -207,13 +201,6 @@ def write_parquet(tables: Iterable[Table], place: Path) -> str:
     return f"written to {place}: {rows} rows, one a frame"
 
 
-def read_parquet(file: Path) -> Table:
-    """Read a table that :func:`write_parquet` wrote."""
-    import pyarrow.parquet as pq
-
-    return pq.read_table(file)
-
-
 def localize_recording(
     source: Path | str,
     map: Path | str | None = None,  # noqa: A002  (what users call it)
@@ -237,7 +224,14 @@ def localize_recording(
         ValueError: for a recording, map or settings that cannot be used.
         ImportError: without pyarrow (``pip install 'rs_localizer[table]'``).
     """
-    config = _config(map, settings)
+    values: dict[str, Any] = {}
+    if isinstance(settings, Mapping):
+        values = dict(settings)
+        if faults := [fault for name in values if (fault := unknown(name))]:
+            raise ValueError(f"settings: {faults[0]}")
+    elif settings is not None:
+        values = load_params_file(Path(settings))
+    config = build(values if map is None else values | {"map_file": str(map)})
     if config.of_cameras:
         raise ValueError("a table is of one camera: leave the setting cameras out")
     with open_bag(Path(source)) as bag:
@@ -247,20 +241,3 @@ def localize_recording(
             if frame.result or frame.result.reason not in NO_FRAMES:
                 rows.add(frame.stamp_ns, frame.result)
     return rows.table()
-
-
-def _config(
-    map_file: Path | str | None, settings: Mapping[str, Any] | Path | str | None
-) -> NodeConfig:
-    if settings is None:
-        values: dict[str, Any] = {}
-    elif isinstance(settings, Mapping):
-        values = dict(settings)
-        for name in values:
-            if (fault := unknown(name)) is not None:
-                raise ValueError(f"settings: {fault}")
-    else:
-        values = load_params_file(Path(settings))
-    if map_file is not None:
-        values["map_file"] = str(map_file)
-    return build(values)

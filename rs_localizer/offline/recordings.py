@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """All correspondences, or the whole IMU, of a recording at once: for estimators of many images."""
 
+import contextlib
 from collections import Counter
 from dataclasses import dataclass
 
@@ -15,8 +16,8 @@ from rs_localizer.io.clouds import Correspondences, read_correspondences, read_k
 from rs_localizer.io.imu import ImuRecording, read_imu
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError
-from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, KEYPOINTS, MAP_POINTS
-from rs_localizer.io.transforms import Transform, TransformError, TransformTree
+from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, KEYPOINTS, MAP_POINTS, TF_STATIC
+from rs_localizer.io.transforms import TransformError, TransformTree
 from rs_localizer.matching import Matcher, MatchError
 from rs_localizer.offline.replay import TF_TYPE, Topics, as_tf2, imu_topics, tf_topics
 from rs_localizer.pipeline.inputs import CAMERA_INFO_TYPE, IMAGE_TYPES, IMU_TYPE
@@ -28,10 +29,6 @@ class Recorded:
 
     calibration: Calibration
     clouds: tuple[Correspondences, ...]
-
-    @property
-    def map_frame(self) -> str:
-        return self.clouds[0].frame
 
 
 def read_recording(bag: BagReader, topics: Topics, landmarks: Map | None = None) -> Recorded:
@@ -46,9 +43,9 @@ def read_recording(bag: BagReader, topics: Topics, landmarks: Map | None = None)
     clouds: list[Correspondences] = []
     calibration: Calibration | None = None
     faults: Counter[str] = Counter()
-    inputs = topics.inputs
+    inputs = {topic: name for name, topic in topics.of.items()}
     for topic, _, message in bag.messages(topics.names):
-        name = inputs[topic].topic
+        name = inputs[topic]
         try:
             if name == CAMERA_INFO:
                 read = read_camera_info(message)
@@ -102,19 +99,22 @@ def read_imu_recording(bag: BagReader, topic: str | None, camera_frame: str) -> 
         rates.append(reading.angular_velocity)
     if not stamps:
         raise ValueError(f"{bag.path} has no usable message on {topic}{fault}")
-    hung = transform_between(bag, camera_frame, frame)
-    return ImuRecording(
-        np.array(stamps, np.int64), np.array(rates), None if hung is None else hung.rotation
-    )
+    tree, turn = TransformTree(), None
+    for tf in tf_topics(bag, TF_TYPE):
+        for _, _, message in bag.messages((tf,)):
+            tree.add(as_tf2(message), static=tf == TF_STATIC)
+    with contextlib.suppress(TransformError):
+        turn = tree.lookup(camera_frame, frame, None).rotation
+    return ImuRecording(np.array(stamps, np.int64), np.array(rates), turn)
 
 
-def optical_frame(bag: BagReader, info: str | None = None, image: str | None = None) -> str:
+def optical_frame(bag: BagReader, info: str | None = None) -> str:
     """Return the camera's frame, by its first camera_info or image; empty if unknown.
 
     Args:
-        info, image: topics; None: the only one of its type.
+        info: topic; None: the only one of its type.
     """
-    for types, topic in (((CAMERA_INFO_TYPE,), info), (IMAGE_TYPES, image)):
+    for types, topic in (((CAMERA_INFO_TYPE,), info), (IMAGE_TYPES, None)):
         try:
             source = bag.find_topic(types, topic, "")
         except BagError:
@@ -122,15 +122,3 @@ def optical_frame(bag: BagReader, info: str | None = None, image: str | None = N
         for _, _, message in bag.messages([source]):
             return str(message.header.frame_id)
     return ""
-
-
-def transform_between(bag: BagReader, camera: str, imu: str) -> Transform | None:
-    """Return ``camera_from_imu``, or of any two frames, by TF; None if not connected."""
-    tree = TransformTree()
-    for topic in tf_topics(bag, TF_TYPE):
-        for _, _, message in bag.messages((topic,)):
-            tree.add(as_tf2(message), static=topic == "/tf_static")
-    try:
-        return tree.lookup(camera, imu, None)
-    except TransformError:
-        return None

@@ -95,29 +95,13 @@ class Topics:
     @property
     def frames(self) -> str:
         """The topic whose messages are localized; of a rig, that of the first camera."""
-        return self.all_frames[0]
-
-    @property
-    def all_frames(self) -> list[str]:
-        """The topics of all cameras whose messages are localized."""
-        return [topic for name, topic in self.of.items() if input_named(name).role == Role.FRAMES]
-
-    @property
-    def lacks_map(self) -> bool:
-        """True if the frames need a map that the recording does not have."""
-        names = (input_named(name) for name in self.of)
-        frames = next(item for item in names if item.role == Role.FRAMES)
-        return frames.needs == MAP_POINTS and MAP_POINTS not in self.of
+        items = self.of.items()
+        return next(topic for name, topic in items if input_named(name).role == Role.FRAMES)
 
     @property
     def names(self) -> tuple[str, ...]:
         """All of them."""
         return tuple(self.of.values())
-
-    @property
-    def inputs(self) -> dict[str, Input]:
-        """The inputs by their topics in the recording."""
-        return {topic: input_named(name) for name, topic in self.of.items()}
 
     def without(self, name: str) -> Topics:
         """Return the topics without that of an input."""
@@ -344,7 +328,8 @@ def prepare_replay(
         topics = find_topics(bag, given)
     if config.imu.use == ImuUse.NONE:
         topics = topics.without(IMU)
-    if topics.lacks_map and not config.map_file:
+    needed = {input_named(name).needs for name in topics.of}
+    if MAP_POINTS in needed - topics.of.keys() and not config.map_file:
         raise BagError(f"{bag.path} has {topics.frames} and no map; give one with --map")
     if DETECTIONS in topics.of and not config.marker_map:
         raise BagError(f"{bag.path} has {topics.frames}; -p marker_map:=FILE says where tags are")
@@ -387,7 +372,8 @@ def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterato
     last: Item | None = None
     for last in messages:
         topic, recorded_ns, message = last
-        localizer.take_zero_for_time(recorded_ns)
+        # A stamp of 0 is a time where a recording has its message at 0, too.
+        localizer.stream.zero_is_time = recorded_ns == 0
         for result in _each(inputs[topic].take_message(localizer, message)):
             yield answer(recorded_ns, message, result)
     for result in localizer.flush():

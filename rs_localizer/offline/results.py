@@ -177,7 +177,7 @@ class Tally:
             lost = sum(n for reason, n in self.refused.items() if reason not in NO_FRAMES)
             self.total = self.localized + lost
         self.aid = localizer.aid.state
-        if (measured := localizer.shutter.measured) is not None:
+        if (measured := localizer.tracker.shutter.measured) is not None:
             self.readout = measured.readout_time, measured.deviation
 
     @property

@@ -10,8 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from rs_localizer import matching
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array
@@ -86,25 +84,18 @@ class CameraFrames(FrameLocalizer):
         self._faults: set[str] = set()  # of the shutter, which have been noticed
 
     @property
-    def _camera(self) -> Camera:
-        (camera,) = self._cameras.values()
-        return camera
+    def camera(self) -> Camera:
+        """The camera, by the latest calibration and settings."""
+        return self._cameras[""]
 
     @property
     def _context(self) -> FrameContext:
         """Knowledge of the next frame."""
-        return FrameContext(self._config.readout_time_deviation, self._landmarks.error_modes)
+        return FrameContext(self.config.readout_time_deviation, self.landmarks.error_modes)
 
     def _middle_row_ns(self, stamp_ns: int) -> int:
         """Return the time at which the middle row of the image with this stamp was exposed."""
-        return middle_row_ns(self._config, self._camera, stamp_ns)
-
-    @property
-    def view_corners(self) -> Array:
-        """Bearings (4,3) of the image's corners, in camera axes."""
-        width, height = np.array(self._camera.size) - 1.0
-        corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
-        return self._camera.bearings(corners)
+        return middle_row_ns(self.config, self.camera, stamp_ns)
 
     def awaits_readings(self, stamp_ns: int, patience: float) -> bool:
         """Return True if readings of the frame with this stamp may come within so many seconds."""
@@ -112,7 +103,7 @@ class CameraFrames(FrameLocalizer):
 
     def _moment(self, time_ns: int) -> Moment:
         """Return what readings at a time are for."""
-        return Moment(self._tracker, self._config, time_ns, self.camera_frame, self.transforms)
+        return Moment(self.tracker, self.config, time_ns, self.camera_frame, self.transforms)
 
     def localize(self, message: Any) -> Localized | Refusal | None:
         """Localize one sensor_msgs/PointCloud2 of correspondences; never raises for bad ones."""
@@ -121,12 +112,12 @@ class CameraFrames(FrameLocalizer):
 
     def localize_cloud(self, cloud: Correspondences) -> Localized | Refusal | None:
         """Localize correspondences, however they came; None: the frame waits (``output_lag``)."""
-        refusal = self._stream.follow(cloud.stamp_ns, cloud.frame)
+        refusal = self.stream.follow(cloud.stamp_ns, cloud.frame)
         if refusal is not None:
             return refusal
         result = self._localize(cloud)
         if result:
-            self._landmarks.lacking = False  # who sends correspondences needs none
+            self.landmarks.lacking = False  # who sends correspondences needs none
         return self._delayed(result, cloud.stamp_ns)
 
     def localize_keypoints(self, message: Any) -> Localized | Refusal | None:
@@ -138,24 +129,24 @@ class CameraFrames(FrameLocalizer):
         keypoints = read_or_refuse(read_keypoints, message, Reason.BAD_KEYPOINTS)
         if isinstance(keypoints, Refusal):
             return keypoints
-        if self.map is not None:
-            refusal = self._stream.follow(keypoints.stamp_ns, self.map.frame)
+        if self.landmarks.map is not None:
+            refusal = self.stream.follow(keypoints.stamp_ns, self.landmarks.map.frame)
             if refusal is not None:
                 return refusal
-        by = self._landmarks.matching_by(keypoints)
+        by = self.landmarks.matching_by(keypoints)
         if isinstance(by, Refusal):
             return by
-        if (cloud := self._landmarks.repeated(keypoints)) is not None:
+        if (cloud := self.landmarks.repeated(keypoints)) is not None:
             return self._delayed(self._localize(cloud), keypoints.stamp_ns)
         if by == matching.MatchBy.DESCRIPTOR:
             time_ns = self._middle_row_ns(keypoints.stamp_ns)
-            if self.map is not None:
-                self._expect(time_ns, self.map.frame)
-            prior = self._tracker.prediction(time_ns, context=self._context)
-            result = None if prior is None else self._localize_by_map(keypoints, prior)
-            # Without its mounting a pose is none the worse.
-            if result or (result is not None and result.reason is Reason.NO_TRANSFORM):
-                return self._delayed(result, keypoints.stamp_ns)
+            if self.landmarks.map is not None:
+                self._expect(time_ns, self.landmarks.map.frame)
+            if (prior := self.tracker.prediction(time_ns, context=self._context)) is not None:
+                result = self._localize_by_map(keypoints, prior)
+                # Without its mounting a pose is none the worse.
+                if result or result.reason is Reason.NO_TRANSFORM:
+                    return self._delayed(result, keypoints.stamp_ns)
         return self._delayed(self._localize_by_map(keypoints, None), keypoints.stamp_ns)
 
     def localize_detections(self, message: Any) -> Localized | Refusal | None:
@@ -166,7 +157,7 @@ class CameraFrames(FrameLocalizer):
         return cloud if isinstance(cloud, Refusal) else self.localize_cloud(cloud)
 
     def _localize_by_map(self, keypoints: Keypoints, prior: Prior | None) -> Localized | Refusal:
-        cloud = self._landmarks.match(keypoints, self._camera, prior)
+        cloud = self.landmarks.match(keypoints, self.camera, prior)
         return cloud if isinstance(cloud, Refusal) else self._localize(cloud)
 
     def _localize(self, cloud: Correspondences) -> Localized | Refusal:
@@ -175,8 +166,8 @@ class CameraFrames(FrameLocalizer):
         cloud = self._checked(cloud)
         time_ns, context = self._middle_row_ns(cloud.stamp_ns), self._context
         self._expect(time_ns, cloud.frame)
-        moment = published_moment(self._config, self._camera, cloud.stamp_ns)
-        tracker, frame = self._tracker, self._moment(time_ns)
+        moment = published_moment(self.config, self.camera, cloud.stamp_ns)
+        tracker, frame = self.tracker, self._moment(time_ns)
         readings = self.aid.readings(frame)
         tracker.localize(
             time_ns, cloud.points, cloud.pixels, cloud.scores, readings=readings, context=context
@@ -216,28 +207,28 @@ class CameraFrames(FrameLocalizer):
         """Tell the tracker what others know of the pose at a time, if it knows nothing itself."""
         if not (self.calibrations and self._pose_prior.given):
             return
-        if self._tracker.prediction(time_ns) is not None:
+        if self.tracker.prediction(time_ns) is not None:
             return
         prior = self._pose_prior.prior(self._moment(time_ns), map_frame)
         if prior is not None:
-            self._tracker.expect(time_ns, prior)
+            self.tracker.expect(time_ns, prior)
 
     def _published(
         self, cloud: Correspondences, result: Estimate | Failure, moment: PublishedMoment
     ) -> Localized | Refusal:
         """Return a result of the body at the published moment."""
         # A part of the map that lies elsewhere leaves smooth errors, too.
-        if self._tracker.lens.fault and not (self._tracker.pace.is_odd or self._tracker.moved):
-            self._notice(Notice.LENS, self._tracker.lens.fault)
+        if self.tracker.lens.fault and not (self.tracker.pace.is_odd or self.tracker.moved):
+            self._notice(Notice.LENS, self.tracker.lens.fault)
         if not result:
             return Refusal(result.reason, result.detail)
         if result.integrity > DOUBTFUL:
             text = f"pose or map are wrong with a probability of {result.integrity:.0%}"
             self._notice(Notice.DOUBTFUL, text)
-        elif not self._tracker.pace.is_odd:  # which also looks like a moved part of the map
+        elif not self.tracker.pace.is_odd:  # which also looks like a moved part of the map
             names = () if self._tags is None else self._tags.names
-            gone = stale_landmarks(cloud, self._tracker.stale(cloud.points), names)
-            moved = moved_landmarks(cloud, self._tracker.moved, names)
+            gone = stale_landmarks(cloud, self.tracker.stale(cloud.points), names)
+            moved = moved_landmarks(cloud, self.tracker.moved, names)
             for said in filter(None, (gone, moved)):
                 self._notice(Notice.STALE_LANDMARKS, said)
         if result.left_out:
@@ -249,7 +240,7 @@ class CameraFrames(FrameLocalizer):
 
         None while the first frames wait.
         """
-        tracker = self._tracker
+        tracker = self.tracker
         if tracker.output_lag == 0 or tracker.newest_ns != self._middle_row_ns(stamp_ns):
             return newest
         found = tracker.delayed
@@ -265,17 +256,17 @@ class CameraFrames(FrameLocalizer):
 
     def flush(self) -> list[Localized | Refusal]:
         """Return the results of frames that still wait for others: none will come."""
-        return list(map(self._late, self._tracker.flush()))
+        return list(map(self._late, self.tracker.flush()))
 
     @property
     def predicts(self) -> bool:
         """True if frames are tracked, so that :meth:`at` knows the motion between them."""
-        return self._tracker.remembers_motion
+        return self.tracker.remembers_motion
 
     def snapshot(self) -> CameraFrames:
         """Return a copy for :meth:`at` in another thread, while frames are localized here."""
         there = copy(self)
-        there._tracker = self._tracker.snapshot()
+        there.tracker = self.tracker.snapshot()
         return there
 
     def at(self, stamp_ns: int) -> Localized | Refusal | None:
@@ -286,10 +277,10 @@ class CameraFrames(FrameLocalizer):
         """
         if not self.predicts or self._newest is None:
             return None
-        newest_ns, samples = self._tracker.newest_ns, None
+        newest_ns, samples = self.tracker.newest_ns, None
         if newest_ns is not None and stamp_ns > newest_ns:
             samples = self.aid.ahead(self._moment(stamp_ns))
-        found = self._tracker.at(stamp_ns, samples)
+        found = self.tracker.at(stamp_ns, samples)
         if found is None:
             return None
         cloud = replace(self._newest, stamp_ns=stamp_ns)

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Oddities of correspondences that a reader of clouds cannot see, and that refuse no frame."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -8,22 +8,18 @@ camera and a rig share stands here; ``CameraFrames`` and ``RigFrames`` localize.
 ``base_frame``.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import fields, replace
 
 import numpy as np
 
-from rs_localizer.config import Imu, ImuUse, NodeConfig, PublishTf, RefinementKind, RigSettings
+from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.camera_info import Calibration
 from rs_localizer.io.clouds import Correspondences, select_inliers, thin_cloud
-from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import CAMERA_INFO, MAP_POINTS
 from rs_localizer.io.transforms import Transforms, TransformTree
@@ -35,7 +31,7 @@ from rs_localizer.pipeline.published import is_mounting_late, of_body
 from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
 from rs_localizer.pipeline.stream import Stream
 from rs_localizer.pipeline.what_fits import Mistakes
-from rs_localizer.shutter_watch import ShutterWatch
+from rs_localizer.settings import in_effect, of_estimates
 from rs_localizer.tracking import Tracker
 
 ANY_CALIBRATION = Calibration(
@@ -70,11 +66,11 @@ class FrameLocalizer(ABC):
         self.aid: AidInput = AidInput(notice)
         self.calibrations: dict[str, Calibration] = {}
         """What the last usable camera_info of each camera said; of one without a name: ``""``."""
-        self._landmarks = Landmarks(notice)
+        self.landmarks = Landmarks(notice)
         self._lenses: dict[str, Camera] = {}  # of camera_file
-        self._stream = Stream(notice, self._forget_motion)
-        self._config = in_effect(config)
-        self._apply_settings(self._config)
+        self.stream = Stream(notice, self._forget_motion)
+        self.config = in_effect(config)
+        self._apply_settings(self.config)
 
     @abstractmethod
     def _new_tracker(self, config: NodeConfig, cameras: Mapping[str, Camera]) -> Tracker:
@@ -88,10 +84,6 @@ class FrameLocalizer(ABC):
     def flush(self) -> list[Localized | Refusal]:
         """Return the results of frames that still wait for others: none will come."""
 
-    @property
-    def config(self) -> NodeConfig:
-        return self._config
-
     def change(self, config: NodeConfig) -> bool:
         """Use these settings from the next frame on; whether they start the track afresh.
 
@@ -99,8 +91,8 @@ class FrameLocalizer(ABC):
         shutter watch as they are.
         """
         config = in_effect(config)
-        if of_estimates(config) == of_estimates(self._config):
-            self._config = config
+        if of_estimates(config) == of_estimates(self.config):
+            self.config = config
             return False
         self._apply_settings(config)
         return True
@@ -113,47 +105,37 @@ class FrameLocalizer(ABC):
             )
             for name, own in config.shutters.items()
         }
-        self._tracker = self._new_tracker(config, cameras)
-        self._cameras, self._config = cameras, config
+        self.tracker = self._new_tracker(config, cameras)
+        self._cameras, self.config = cameras, config
         self._forget_frames()
         self._mistakes = Mistakes(self._notice)
 
     @property
     def calibration(self) -> Calibration | None:
         """The last usable calibration of the first camera."""
-        return self.calibrations.get(self._config.cameras[0])
+        return self.calibrations.get(self.config.cameras[0])
 
     @property
     def camera_frame(self) -> str:
         """The optical frame of the first camera that is known; empty as long as none is."""
-        known = (self.calibrations.get(name) for name in self._config.cameras)
+        known = (self.calibrations.get(name) for name in self.config.cameras)
         return next((calibration.frame for calibration in known if calibration), "")
 
     @property
     def missing(self) -> tuple[str, ...]:
         """The inputs that have to come before a frame can be localized."""
-        infos = tuple(f"{name}/{CAMERA_INFO}".lstrip("/") for name in self._config.cameras)
+        infos = tuple(f"{name}/{CAMERA_INFO}".lstrip("/") for name in self.config.cameras)
         infos = () if self.calibrations else infos
-        return (*infos, MAP_POINTS) if self._landmarks.lacking else infos
-
-    @property
-    def map(self) -> Map | None:
-        """The map that keypoints are matched with."""
-        return self._landmarks.map
+        return (*infos, MAP_POINTS) if self.landmarks.lacking else infos
 
     @property
     def map_points(self) -> Array | None:
         """Landmarks (n,3), or corners (n,4,3) of markers; None: correspondences bring their own."""
-        return None if self.map is None else self.map.points
-
-    @property
-    def shutter(self) -> ShutterWatch:
-        """Who says that scan direction or readout time are contradicted."""
-        return self._tracker.shutter
+        return None if self.landmarks.map is None else self.landmarks.map.points
 
     def describe(self) -> tuple[dict[str, str], dict[str, str]]:
         """Return values for people, and what is odd, by readable names."""
-        state, watch = self.aid.state, self.shutter
+        state, watch = self.aid.state, self.tracker.shutter
         values, odd = ({}, {}) if state is None else (state.values(), state.oddities())
         if watch.fault:
             odd["readout_time"] = watch.fault
@@ -162,18 +144,14 @@ class FrameLocalizer(ABC):
             values["Readout time seen (ms)"] = f"{readout:.2f} +- {deviation:.2f}"
         return values, odd
 
-    def take_zero_for_time(self, recorded_ns: int) -> None:
-        """Take a stamp of 0 for a time where a recording has its message at 0, too."""
-        self._stream.zero_is_time = recorded_ns == 0
-
     def reset(self) -> None:
         """Forget the previous frames."""
-        self._stream.reset()
+        self.stream.reset()
         self._forget_motion()
 
     def _forget_motion(self) -> None:
         self._forget_frames()
-        self._tracker.reset()
+        self.tracker.reset()
 
     def calibrate(self, calibration: Calibration, name: str = "") -> None:
         """Use this calibration of a camera from the next frame on.
@@ -186,7 +164,7 @@ class FrameLocalizer(ABC):
             calibration = calibration.with_lens(self._lenses[name])
         if calibration == before:  # drivers repeat it with every image
             return
-        own = self._config.shutters[name]
+        own = self.config.shutters[name]
         self._cameras[name] = calibration.camera(own.readout_time, own.scan_direction)
         self._use_camera(name, calibration)
         if before is not None:
@@ -200,7 +178,7 @@ class FrameLocalizer(ABC):
 
     def _use_camera(self, name: str, calibration: Calibration) -> None:
         self.calibrations[name] = calibration
-        self._apply_settings(self._config)
+        self._apply_settings(self.config)
 
     def awaits_readings(self, stamp_ns: int, patience: float) -> bool:
         """Return True if readings of this frame may come within this many seconds."""
@@ -211,7 +189,7 @@ class FrameLocalizer(ABC):
 
         That are readings of its exposure, and the mounting at its last row.
         """
-        config = self._config
+        config = self.config
         if self.awaits_readings(stamp_ns, config.imu.wait):
             return config.imu.wait
         last_ns = stamp_ns + round(1e9 * (config.stamp_offset + config.readout_time))
@@ -230,11 +208,7 @@ class FrameLocalizer(ABC):
             for name in self.config.cameras:
                 self._lenses[name] = read_calibration(f"{file}#{name}" if name else file)
         if self.config.map_file:
-            self.use_map(read_landmarks(self.config.map_file, self.config.map_frame))
-
-    def use_map(self, landmarks: Map) -> None:
-        """Match keypoints with this map from the next frame on."""
-        self._landmarks.use_map(landmarks)
+            self.landmarks.use_map(read_landmarks(self.config.map_file, self.config.map_frame))
 
     def _result(
         self, cloud: Correspondences, estimate: Estimate, moment: PublishedMoment
@@ -246,26 +220,16 @@ class FrameLocalizer(ABC):
             estimate: of the first camera.
             moment: for which they are valid.
         """
+        config, shutter = self.config, self.tracker.shutter
         first = next(iter(self._cameras.values()))
-        pose, twist = published_motion(estimate, moment, self._config, first, self.shutter)
+        pose, twist = published_motion(estimate, moment, config, first, shutter)
         seen = np.asarray(estimate.inliers) if len(cloud.table) else np.zeros(0, np.bool_)
-        return self.mounted(
-            Localized(
-                input_stamp_ns=cloud.stamp_ns,
-                stamp_ns=moment.stamp_ns,
-                map_frame=cloud.frame,
-                body_frame=self.camera_frame,
-                pose=pose,
-                twist=twist,
-                inliers=select_inliers(cloud.table, seen, np.asarray(estimate.residuals)),
-                dropped=cloud.dropped,
-                estimate=estimate,
-            )
-        )
-
-    def mounted(self, localized: Localized) -> Localized | Refusal:
-        """Return the result of ``base_frame`` from the result of the camera."""
-        return of_body(localized, self.config, self.transforms)
+        inliers = select_inliers(cloud.table, seen, np.asarray(estimate.residuals))
+        of_camera = Localized(
+            cloud.stamp_ns, moment.stamp_ns, cloud.frame, self.camera_frame, pose, twist, inliers,
+            cloud.dropped, estimate,
+        )  # fmt: skip
+        return of_body(of_camera, config, self.transforms)
 
     def _checked(self, cloud: Correspondences, name: str = "") -> Correspondences:
         """Return at most a camera's part of ``max_points``, and give notice of what is odd."""
@@ -274,35 +238,3 @@ class FrameLocalizer(ABC):
         for notice, text in odd.items():
             self._notice(notice, f"{name}: {text}" if name else text)
         return thin_cloud(cloud, most, camera.size)
-
-
-# Settings that change what is made of an estimate, or which points come to it, and not how it is
-# made. All others start the track afresh.
-_BESIDE = frozenset({
-    "readout_time_deviation", "pose_time", "max_points", "base_frame",
-    "odom_frame", "publish_tf", "tf_rate", "hold", "two_d_mode",
-    "transform_tolerance", "map_file", "map_frame", "marker_map",
-    "autostart", "output_rate", "camera_file",
-})  # fmt: skip
-
-
-def in_effect(config: NodeConfig) -> NodeConfig:
-    """Return the settings without what ``refinement`` turns off.
-
-    That is what knows more than a frame's points, and TF where no covariance says how good a pose
-    is.
-    """
-    if config.refinement == RefinementKind.FULL:
-        return config
-    config = replace(config, imu=replace(config.imu, use=ImuUse.NONE), tracking=False)
-    if config.refinement == RefinementKind.NONE:
-        config = replace(config, publish_tf=PublishTf.NONE)
-    return config
-
-
-def of_estimates(config: NodeConfig) -> tuple[object, ...]:
-    """Return what estimates depend on: of a rig's window and an IMU, only where there are any."""
-    unused = config.of_cameras or config.imu.use == ImuUse.NONE
-    imu = Imu(use=ImuUse.NONE) if unused else replace(config.imu, wait=0.0)
-    config = replace(config, imu=imu, rig=config.rig if config.of_cameras else RigSettings())
-    return tuple(getattr(config, it.name) for it in fields(config) if it.name not in _BESIDE)

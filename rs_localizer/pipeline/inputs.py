@@ -105,7 +105,7 @@ _ROWS = (
     ),
     Input(
         topics.MAP_POINTS, CLOUD_TYPE, "the map for keypoints, latched", Role.STATE,
-        lambda localizer, landmarks: localizer.use_map(landmarks), Reason.BAD_MAP,
+        lambda localizer, landmarks: localizer.landmarks.use_map(landmarks), Reason.BAD_MAP,
         read=read_map, in_words="a map", latched=True, lasting=True,
     ),
     Input(

@@ -10,8 +10,6 @@ ahead of the others, or has gone back alone. When all clocks go back, a recordin
 :class:`RigFrames` localizes the frames.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -209,7 +207,7 @@ class RigFrames(FrameLocalizer):
         return Tracker(localizer, None, tracks, max_prediction=config.max_prediction)
 
     def _apply_settings(self, config: NodeConfig) -> None:
-        before = self._config.rig
+        before = self.config.rig
         super()._apply_settings(config)
         if config.rig != before:
             self._assembler = FrameAssembler(config.cameras, config.rig.window, self._notice)
@@ -241,7 +239,7 @@ class RigFrames(FrameLocalizer):
         self._mounts.pop(name, None)
         if known or self.camera_frame != axes:  # else it is one more of the rig
             self._mounts = {}  # relative to other axes
-            self._apply_settings(self._config)
+            self._apply_settings(self.config)
 
     def add(self, name: str, kind: str, message: Any) -> Iterator[Localized | Refusal]:
         """Take an image of a camera by its name; the results of frames that it completes."""
@@ -250,10 +248,10 @@ class RigFrames(FrameLocalizer):
             self._notice(Notice.NO_IMAGES, f"{name} is left out: {text}")
             yield Refusal(Reason.NO_CAMERA_INFO, text)
             return
-        own, camera = self._config.of_cameras[name], self._cameras[name]
+        own, camera = self.config.of_cameras[name], self._cameras[name]
         cloud = self._read(name, kind, message, camera)
         if not isinstance(cloud, Refusal):
-            cloud = self._stream.unset(cloud.stamp_ns) or cloud
+            cloud = self.stream.unset(cloud.stamp_ns) or cloud
         if isinstance(cloud, Refusal):
             yield cloud
             return
@@ -280,10 +278,10 @@ class RigFrames(FrameLocalizer):
             return replace(found, detail=f"{name}: {found.detail}")
         if isinstance(found, Correspondences):
             return found
-        by = self._landmarks.matching_by(found)
+        by = self.landmarks.matching_by(found)
         if isinstance(by, Refusal):
             return by
-        return self._landmarks.match(found, camera, None)
+        return self.landmarks.match(found, camera, None)
 
     def _localize_frame(self, images: Sequence[CameraImage]) -> Localized | Refusal:
         reference = images[0].cloud
@@ -294,7 +292,7 @@ class RigFrames(FrameLocalizer):
                 f"the points of {images[0].camera} are in frame {reference.frame!r}, others in "
                 f"{', '.join(map(repr, sorted(others)))}: cameras of a rig see one map",
             )
-        refusal = self._stream.follow(images[0].start_ns, reference.frame)
+        refusal = self.stream.follow(images[0].start_ns, reference.frame)
         if refusal is not None:
             return refusal
         refusal = self._mount(images)
@@ -311,20 +309,20 @@ class RigFrames(FrameLocalizer):
         matches = {
             image.camera: tuple(getattr(image.cloud, part) for part in parts) for image in images
         }
-        context = FrameContext(error_modes=self._landmarks.error_modes)
-        result = self._tracker.localize(origin_ns, matches, stamps=starts, context=context)
+        context = FrameContext(error_modes=self.landmarks.error_modes)
+        result = self.tracker.localize(origin_ns, matches, stamps=starts, context=context)
         if not result:
             refusal = Refusal(result.reason, result.detail)
-            localizer = self._tracker.localizer
+            localizer = self.tracker.localizer
             return self._mistakes.explained(
                 refusal,
                 lambda: what_fits.cameras_apart(localizer, matches, starts),
                 Notice.EXTRINSICS,
             )
         assert isinstance(result, RigEstimate)
-        if fault := self._tracker.cameras.fault:
+        if fault := self.tracker.cameras.fault:
             self._notice(Notice.EXTRINSICS, fault)
-        self._landmarks.lacking = False  # who sends correspondences needs none
+        self.landmarks.lacking = False  # who sends correspondences needs none
         return self._localized(images, result, origin_ns)
 
     def _mount(self, images: Sequence[CameraImage]) -> Refusal | None:
@@ -344,16 +342,16 @@ class RigFrames(FrameLocalizer):
                 refusal = Refusal(Reason.NO_TRANSFORM, text)
                 self._notice(Notice.NO_IMAGES, f"{name} is left out: no transform {text}")
         if any(mounts.get(name) is not self._mounts.get(name) for name in {*mounts, *self._mounts}):
-            self._mounts = {name: mounts[name] for name in self._config.cameras if name in mounts}
+            self._mounts = {name: mounts[name] for name in self.config.cameras if name in mounts}
             if self._mounts:
-                self._tracker.mount(self.rig)
+                self.tracker.mount(self.rig)
         return refusal
 
     def _localized(
         self, images: Sequence[CameraImage], result: RigEstimate, origin_ns: int
     ) -> Localized | Refusal:
         """Return the pose and twist of the body at the published moment."""
-        config, first = self._config, images[0].cloud
+        config, first = self.config, images[0].cloud
         time_ns = origin_ns + round(1e9 * result.time)
         stamp_ns = time_ns if config.pose_time == PoseTime.MID_FRAME else first.stamp_ns
         tau = (stamp_ns - time_ns) / (1e9 * result.span)  # exact for a camera alone

@@ -7,8 +7,6 @@ found; residuals alone do not show it. Some such frames have a pose: of a mirror
 fits as it is seen from behind.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executables: take signals in hand, then import what takes long."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Sequence

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Minimal solvers for thousands of samples at once: the paper's problem as a call."""
 
-from __future__ import annotations
-
 import os
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial

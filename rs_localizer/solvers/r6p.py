@@ -22,8 +22,6 @@ tangent of the angle to the initial rotation); up to 20 solutions. The multiplie
 do as well, while v_z, the turn about the optical axis, costs a digit of the eigenvalues.
 """
 
-from __future__ import annotations
-
 import itertools
 from typing import Any, NamedTuple
 

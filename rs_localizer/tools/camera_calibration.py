@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A camera by a recording: readout time with an honest deviation, direction, lens, oddities."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from contextlib import suppress

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A first lens, and its model, from images in which the camera hardly moves (Zhang 2000)."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import cv2

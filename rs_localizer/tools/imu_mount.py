@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """How an IMU goes with the camera: offset of its stamps, rotation and gyroscope bias."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -128,21 +126,17 @@ class MountFound:
     mount: GyroMount
     rotation_deviations: Array  # (3,) rad, about the IMU's axes
     bias_deviations: Array  # (3,) rad/s
-    shape_deviations: Array  # (6,) as of GyroMount.shape
     noise: float  # rad/s, standard deviation of a sample and axis
     inflation: float  # of the offset's deviation, because parts disagree; 1: they do not
 
     @property
-    def time_offset_determined(self) -> bool:
-        return bool(self.time_offset_deviation < _MOST_OFFSET)
-
-    @property
-    def rotation_determined(self) -> bool:
-        return bool(np.all(self.rotation_deviations < _MOST_TURN))
-
-    @property
-    def bias_determined(self) -> bool:
-        return bool(np.all(self.bias_deviations < _MOST_BIAS))
+    def determined(self) -> tuple[bool, bool, bool]:
+        """Whether offset, rotation and bias are known well enough."""
+        return (
+            bool(self.time_offset_deviation < _MOST_OFFSET),
+            bool(np.all(self.rotation_deviations < _MOST_TURN)),
+            bool(np.all(self.bias_deviations < _MOST_BIAS)),
+        )
 
 
 def with_gyro(
@@ -227,7 +221,7 @@ def mount_of(observations: SplineKeypoints, fitted: Fit, inflation: float) -> Mo
         time_offset=mount.delay + later * fitted.state.readout_time,
         time_offset_deviation=inflation * float(np.sqrt(by_offset @ covariance @ by_offset)),
         mount=mount, rotation_deviations=deviations[:3], bias_deviations=deviations[3:6],
-        shape_deviations=deviations[DELAY + 1 :], noise=samples.deviation, inflation=inflation,
+        noise=samples.deviation, inflation=inflation,
     )  # fmt: skip
 
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A board or a wall of markers as PDF or PNG, true to scale."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

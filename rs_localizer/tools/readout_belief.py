@@ -6,8 +6,6 @@ By :class:`ShutterFit` of a map whose shutter nobody knows, and by :class:`Reado
 was given; :mod:`rs_localizer.tools.camera_calibration` has the evidence of a calibration.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -9,8 +9,6 @@ The accelerations of an estimate are too small, as far as the prior took the pla
 keypoints do not tell; and their squares are the sum of as many numbers only as these do tell.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
@@ -27,6 +25,7 @@ from rs_localizer.io.outputs import Localized
 from rs_localizer.offline.replay import inlier_columns
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.pose_at_time import pose_at, published_moment, twist_at
+from rs_localizer.pipeline.published import of_body
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.pipeline.rig_frames import RigFrames
 from rs_localizer.tools.adjust.factors import acceleration_rows
@@ -347,7 +346,7 @@ def smooth_frames(
         if own is not None and (stamp in own_poses or not sampled.determined[k]):
             frame, shaken = own, shaken + 1
         elif sampled.determined[k]:
-            frame = localizer.mounted(Localized(
+            of_camera = Localized(
                 input_stamp_ns=stamp,
                 stamp_ns=int(moments[k]),
                 map_frame=frames[0].map_frame,
@@ -358,7 +357,8 @@ def smooth_frames(
                 dropped=0 if own is None else own.dropped,
                 estimate=estimate,
                 cameras=() if own is None else own.cameras,
-            ))  # fmt: skip
+            )
+            frame = of_body(of_camera, localizer.config, localizer.transforms)
         if frame:
             result.append(frame)
             kept[k] = True

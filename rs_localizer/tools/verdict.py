@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Words on a calibration: the accepted readout time, and the quality of the lens."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
@@ -49,16 +47,6 @@ def lens_refusal(result: CameraCalibration) -> str:
         f"no lens: the principal point would be at {camera.K[0, 2]:.0f}, {camera.K[1, 2]:.0f}, "
         "outside the image; show the map from several sides, in all parts of the image"
     )
-
-
-def refusal(result: CameraCalibration) -> str:
-    """Return one line with the figure if lens or readout time is not determined; or ''."""
-    return lens_refusal(result) or result.disbelief
-
-
-def shape_is_free(result: CameraCalibration) -> bool:
-    """Return True if the map's shape was estimated."""
-    return result.fit.freedom.landmarks > 0.0
 
 
 def moved(result: CameraCalibration, points: Array) -> Array:
@@ -170,11 +158,12 @@ def of_imu(found: CameraCalibration, imu: ImuRecording, stamp_offset: float) -> 
     turn = _numbers(Rotation.from_matrix(one.mount.camera_from_imu).as_quat(canonical=True), 5)
     error = _numbers(np.degrees(one.rotation_deviations), 3)
     bias, errors = (_numbers(np.degrees(each), 3) for each in (one.mount.bias, one.bias_deviations))
-    for name, text, known in (
-        ("imu.time_offset", f"{offset:+.3f} +- {spread:.3f} ms", one.time_offset_determined),
-        ("rotation camera <- imu", f"{turn} (x y z w) +- {error} deg", one.rotation_determined),
-        ("gyroscope bias", f"{bias} +- {errors} deg/s", one.bias_determined),
-    ):  # fmt: skip
+    values = {
+        "imu.time_offset": f"{offset:+.3f} +- {spread:.3f} ms",
+        "rotation camera <- imu": f"{turn} (x y z w) +- {error} deg",
+        "gyroscope bias": f"{bias} +- {errors} deg/s",
+    }
+    for (name, text), known in zip(values.items(), one.determined, strict=True):
         yield f"{name:26} {text if known else f'not observable: {text}'}"
     if one.inflation > 1.0:
         yield (
@@ -183,7 +172,7 @@ def of_imu(found: CameraCalibration, imu: ImuRecording, stamp_offset: float) -> 
         )
     if imu.camera_from_imu is None:
         yield "imu: TF has no transform from it to the camera; its rotation is not checked"
-    elif one.rotation_determined:
+    elif one.determined[1]:
         off = np.degrees(one.mount.turned_from(imu.camera_from_imu))
         chance = _SIGMAS * float(np.degrees(np.linalg.norm(one.rotation_deviations)))
         if off > max(_MOST_TURN, chance):

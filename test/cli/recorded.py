@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.cli.commands import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
+from rs_localizer.io.imu import make_reading
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, simulate_frames
-from rs_localizer.tools.simulation.simulated_imu import ImuSettings, make_imu
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
@@ -49,7 +49,7 @@ def tf(parent: str, child: str, position: Any, turn: Rotation, stamp_ns: int = 0
 
 def imu(stamp_ns: int, rate: Any = (0.0, 0.0, 0.0)) -> Any:
     """A reading of an IMU that is held level."""
-    return make_imu(stamp_ns, np.array(rate), np.array([0.0, 0.0, 9.81]), ImuSettings(), "imu")
+    return make_reading(stamp_ns, np.array(rate), np.array([0.0, 0.0, 9.81]), "imu")
 
 
 def write_mp4(path: Path, images: Iterable[Any], rate: float) -> Path:

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A hand-held gripper with a camera: videos of a room and of demonstrations -> trajectories."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,7 +17,6 @@ from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.recording import MAP, MAP_FRAME
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.markers.map_files import write_marker_map
-from rs_localizer.offline.frame_table import read_parquet
 from rs_localizer.tools.mapping.gauge import through
 from rs_localizer.tools.simulation.renderer import Renderer
 from rs_localizer.tools.simulation.simulated_frames import frame_stamps
@@ -100,7 +97,9 @@ def test_demonstrations_become_trajectories(filmed, tmp_path):
     table = tmp_path / "demos.parquet"
     tables = ["--parquet", str(table), "--workers", "1"]
     assert main([*words, "--out", str(tmp_path / "poses"), *tables]) == 0
-    rows = read_parquet(table).to_pylist()
+    from pyarrow.parquet import read_table  # an extra
+
+    rows = read_table(table).to_pylist()
     both = []
     for k, path in enumerate(filmed.demos):
         mine = [row for row in rows if row["recording"] == str(path)]

@@ -18,7 +18,7 @@ from rs_localizer.io.bags import STORAGES, BagWriter, open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized
 from rs_localizer.io.trajectories import read_motions, read_tum, read_twists
-from rs_localizer.offline import frame_table, results
+from rs_localizer.offline import results
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_recording import write_simulated
 from rs_localizer.tools.simulation.simulated_settings import FrameSettings
@@ -47,13 +47,15 @@ def messages(path: Path) -> list[tuple[str, int, Any]]:
 
 def test_results_that_wait_for_frames_come_at_the_end(recording, tmp_path):
     """As many as without, of the same frames in the same order, each once."""
+    from pyarrow.parquet import read_table  # an extra
+
     words, lag, found = ["replay", str(recording), *SHUTTER, "--parquet"], 3, []
     for k in (0, lag):
         out, table = tmp_path / f"out{k}", tmp_path / f"{k}.parquet"
         given = [str(table), "--out", str(out), "-p", f"output_lag:={k}"]
         assert main([*words, *given]) == 0
         sent = Counter((name, stamp_ns(message)) for name, _, message in messages(out / "result"))
-        rows = frame_table.read_parquet(table)["stamp_ns"].to_pylist()
+        rows = read_table(table)["stamp_ns"].to_pylist()
         found.append((read_tum(out / "poses.txt"), sent, rows))
     (at_once, *others), (later, *again) = found
     assert others == again

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``rs_localizer replay`` of images: the same as detect, then replay of what it wrote."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

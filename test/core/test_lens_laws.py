@@ -6,8 +6,6 @@ Those that see behind the image plane are compared with the formulas of their pa
 point by point; distortion that a calibration lacks, with Brown's and Kannala's.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

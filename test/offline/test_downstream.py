@@ -25,7 +25,13 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.outputs import Localized, messages
-from rs_localizer.io.recording import CAMERA_FRAME, write_frame
+from rs_localizer.io.recording import (
+    CAMERA_FRAME,
+    CAMERA_INFO_TOPIC,
+    CORRESPONDENCES_TOPIC,
+    make_camera_info,
+    make_correspondences,
+)
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.offline.replay import TF_TYPE, find_topics, find_transforms, replay
 from rs_localizer.pipeline.camera_frames import CameraFrames
@@ -98,9 +104,10 @@ def flight(tmp_path_factory) -> Flight:
         for index in range(LENGTH):
             stamp_ns = int(frames.stamp_ns[index])
             points, pixels = frames.seen(index, NOISE)
-            write_frame(
-                bag, believed(frames.camera), stamp_ns, points, pixels, np.arange(len(points))
-            )
+            info = make_camera_info(believed(frames.camera), stamp_ns)
+            cloud = make_correspondences(stamp_ns, points, pixels, np.arange(len(points)))
+            bag.write(CAMERA_INFO_TOPIC, info, stamp_ns)
+            bag.write(CORRESPONDENCES_TOPIC, cloud, stamp_ns)
             # Wheels that began elsewhere, and slip by 2 cm a second.
             drift = np.array([1.0, -2.0, 0.5]) + 0.02 * index / 30
             odometry.append(Transform(turned @ truth[1][index], turned @ truth[0][index] + drift))

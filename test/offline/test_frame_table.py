@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The table of frames: one row a frame, the same bytes whoever makes it."""
 
-from __future__ import annotations
-
 import pickle
 import subprocess
 import sys
@@ -15,6 +13,8 @@ pytest.importorskip(  # of today, which NumPy 1.26 cannot import
     "pyarrow", reason="needs pyarrow (rs_localizer[table])", exc_type=ImportError
 )
 
+from pyarrow.parquet import read_table
+
 import rs_localizer as rsl
 from rs_localizer.cli.commands import main
 from rs_localizer.config import NodeConfig
@@ -23,7 +23,7 @@ from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.offline import frame_table
-from rs_localizer.offline.frame_table import COLUMNS, read_parquet, schema
+from rs_localizer.offline.frame_table import COLUMNS, schema
 from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.refusal import Refusal
 
@@ -59,7 +59,7 @@ def test_rows_say_what_the_messages_say(flights: list[Path], tmp_path: Path) -> 
     words = [str(flights[0]), *SHUTTER, "--out", str(tmp_path / "out"), "--parquet", str(file)]
     assert main(["replay", *words]) == 0
     assert main(["replay", *words, "--overwrite"]) == 0
-    table = read_parquet(file)
+    table = read_table(file)
     assert table.schema == schema()
     assert table.column_names == list(COLUMNS)
     rows = table.to_pylist()
@@ -111,7 +111,7 @@ def test_the_same_bytes_from_one_process_and_from_two(flights: list[Path], tmp_p
         done = subprocess.run(called, input=standard_input, capture_output=True, check=False)
         assert done.returncode == 0, done.stderr
     assert one.read_bytes().startswith(b"PAR1")
-    assert read_parquet(one).num_rows > 3 * 5
+    assert read_table(one).num_rows > 3 * 5
     assert two.read_bytes() == one.read_bytes()
 
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Smoothing of a recording's frames: which moments have one, and whose pose it is."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -188,7 +188,7 @@ def localize(
             **({"readout_time": READOUT_TIME, "base_frame": "base_link"} | settings)
         )
         frames = CameraFrames(config, transforms=transforms)
-        frames.take_zero_for_time(recorded_ns=0)
+        frames.stream.zero_is_time = True
         frames.calibrate(
             read_camera_info(make_camera_info(**({} if roi is None else {"roi": roi})))
         )

@@ -86,7 +86,7 @@ def localized(result: Localized | Refusal, truth: SimulatedFrame) -> Localized:
 @pytest.mark.parametrize("names", [("id",), ("descriptor",), ("id", "descriptor")])
 def test_the_true_pose(frames, make_camera_info, names, tracking):
     node = localizer(make_camera_info, tracking=tracking)
-    node.use_map(read_map(map_cloud(LANDMARKS)))
+    node.landmarks.use_map(read_map(map_cloud(LANDMARKS)))
     for frame in frames:
         result = localized(node.localize_keypoints(keypoints(frame, *names)), frame)
         assert result.map_frame == "map"
@@ -104,7 +104,7 @@ def test_the_true_pose(frames, make_camera_info, names, tracking):
 
 def test_keypoints_that_give_no_pose(frames, make_camera_info):
     node = localizer(make_camera_info)
-    node.use_map(read_map(map_cloud(LANDMARKS)))
+    node.landmarks.use_map(read_map(map_cloud(LANDMARKS)))
     wide = Map(POINTS, None, random_descriptors(4000, np.random.default_rng(0), 64), "map")
     strangers = Map(POINTS, IDS + 200_000, None, "map")
     unfit = (
@@ -123,7 +123,7 @@ def test_keypoints_that_give_no_pose(frames, make_camera_info):
         assert said[0] == reason
         assert detail in said[1]
     unknown = CameraFrames(NodeConfig())
-    unknown.use_map(read_map(map_cloud(LANDMARKS)))
+    unknown.landmarks.use_map(read_map(map_cloud(LANDMARKS)))
     assert refused(unknown.localize_keypoints(keypoints(frames[0], "id")))[0] == "no_camera_info"
     # None of this left a trace.
     localized(node.localize_keypoints(keypoints(frames[5], "id")), frames[5])
@@ -133,7 +133,7 @@ def test_keypoints_that_give_no_pose(frames, make_camera_info):
 def test_keypoints_that_repeat_are_an_image_that_does(frames, make_camera_info, names):
     """Matched near a prediction, the same keypoints would not give the same matches."""
     node = localizer(make_camera_info)
-    node.use_map(read_map(map_cloud(LANDMARKS)))
+    node.landmarks.use_map(read_map(map_cloud(LANDMARKS)))
     messages = [keypoints(frame, *names) for frame in frames[:6]]
     for k in (3, 4):  # hung
         stamp = messages[k].header.stamp
@@ -143,9 +143,9 @@ def test_keypoints_that_repeat_are_an_image_that_does(frames, make_camera_info, 
     assert [bool(result) for result in found] == [True, True, True, False, False, True]
     assert {found[3].reason, found[4].reason} == {"repeated_image"}
     # Another map is matched anew.
-    assert node._landmarks.repeated(read_keypoints(messages[5])) is not None
-    node.use_map(Map(POINTS + 1.0, IDS, LANDMARKS.descriptors, "map"))
-    assert node._landmarks.repeated(read_keypoints(messages[5])) is None
+    assert node.landmarks.repeated(read_keypoints(messages[5])) is not None
+    node.landmarks.use_map(Map(POINTS + 1.0, IDS, LANDMARKS.descriptors, "map"))
+    assert node.landmarks.repeated(read_keypoints(messages[5])) is None
 
 
 def test_a_wrong_prediction_is_found_out(frames, make_camera_info, monkeypatch):
@@ -159,14 +159,14 @@ def test_a_wrong_prediction_is_found_out(frames, make_camera_info, monkeypatch):
 
     monkeypatch.setattr(rs_localizer.pipeline.keypoint_map, "Matcher", Asked)
     node = localizer(make_camera_info)
-    node.use_map(read_map(map_cloud(LANDMARKS)))
+    node.landmarks.use_map(read_map(map_cloud(LANDMARKS)))
     for frame in frames[:3]:
         localized(node.localize_keypoints(keypoints(frame, "descriptor")), frame)
     assert asked == [False, True, True]
     away = Map(
         POINTS @ np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]]), None, LANDMARKS.descriptors, "map"
     )
-    node.use_map(read_map(map_cloud(away)))
+    node.landmarks.use_map(read_map(map_cloud(away)))
     asked.clear()
     for frame in frames[3:5]:
         result = node.localize_keypoints(keypoints(frame, "descriptor"))
@@ -178,7 +178,8 @@ def test_a_wrong_prediction_is_found_out(frames, make_camera_info, monkeypatch):
 def test_coordinates_far_from_the_origin_keep_their_digits(frames, make_camera_info):
     away = np.array([4e6, 5e5, 100.0])
     node = localizer(make_camera_info)
-    node.use_map(read_map(map_cloud(Map(POINTS + away, IDS, LANDMARKS.descriptors, "utm"))))
+    utm = Map(POINTS + away, IDS, LANDMARKS.descriptors, "utm")
+    node.landmarks.use_map(read_map(map_cloud(utm)))
     for frame in frames[:3]:
         result = node.localize_keypoints(keypoints(frame, "descriptor"))
         assert result, result

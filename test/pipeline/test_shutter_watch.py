@@ -82,7 +82,7 @@ class Watched:
 
     @property
     def watch(self) -> ShutterWatch:
-        return self.frames.shutter
+        return self.frames.tracker.shutter
 
     @property
     def notices(self) -> list[str]:
@@ -140,7 +140,7 @@ def test_a_robot_that_drives_slowly_is_hardly_ever_doubted():
         for frame in simulate_frames(CAMERA, motion, world, seen, seed=seed):
             cloud = cloud_of(frame.stamp_ns + 10**18, frame.points, frame.pixels)
             assert frames.localize(cloud)
-        doubted.append(not frames.shutter.trusted)
+        doubted.append(not frames.tracker.shutter.trusted)
     assert not any(doubted)
 
 
@@ -150,7 +150,7 @@ def test_a_real_camera_whose_stamps_are_not_its_own_raises_no_alarm():
     frames = CameraFrames(NodeConfig(readout_time=0.0129), lambda name, _: notices.append(name))
     with open_bag(data.path(data.WEBCAM)) as bag:
         assert sum(bool(answer.result) for answer in replay(bag, find_topics(bag), frames)) > 100
-    assert frames.shutter.measured is not None
+    assert frames.tracker.shutter.measured is not None
     assert "readout_time" not in notices
 
 
@@ -183,9 +183,9 @@ def test_a_global_shutter_is_known_within_a_second_and_has_no_twist(tracking):
         answers = replay(bag, find_topics(bag), frames)
         found = [found for (*_, found), _ in zip(answers, range(40), strict=False)]
     assert all(found)
-    assert frames.shutter.is_global
-    assert not frames.shutter.trusted
-    assert "(a global shutter)" in frames.shutter.fault
+    assert frames.tracker.shutter.is_global
+    assert not frames.tracker.shutter.trusted
+    assert "(a global shutter)" in frames.tracker.shutter.fault
     assert found[-1].twist is None
     assert np.linalg.norm(found[29].estimate.angular_velocity) < 1e-4  # 0.3 deg/s
 
@@ -400,7 +400,7 @@ def test_a_real_camera_told_the_other_axis_is_refused():
         results = [answer.result for answer in replay(bag, find_topics(bag), frames)]
     # It moves slowly. Before, 13 of 121 images were refused, and not for this.
     assert not any(results[40:])
-    assert "moves top_to_bottom in 1" in frames.shutter.fault
+    assert "moves top_to_bottom in 1" in frames.tracker.shutter.fault
 
 
 class Swayed(Shaken):

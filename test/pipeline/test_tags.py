@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tags of AprilRobotics' own detector: its pixels and corners, the poses that come of them."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace

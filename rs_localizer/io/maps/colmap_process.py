@@ -33,7 +33,7 @@ def read(folder: str) -> dict[str, Any]:
     points = sorted(model.points3D.items())
     images = [item for item in sorted(model.images.items()) if _called(item[1].has_pose)]
     tracks = [[(e.image_id, e.point2D_idx) for e in point.track.elements] for _, point in points]
-    poses = [_pose(image) for _, image in images]
+    poses = [_called(image.cam_from_world).matrix() for _, image in images]
     features = [image.points2D for _, image in images]
     flat = [feature for some in features for feature in some]
     shown = [feature.point3D_id for feature in flat]
@@ -52,10 +52,6 @@ def read(folder: str) -> dict[str, Any]:
         "features": np.cumsum([0, *map(len, features)]),
         "cameras": np.array([_camera(*item) for item in sorted(model.cameras.items())], np.str_),
     }
-
-
-def _pose(image: Any) -> Any:
-    return _called(image.cam_from_world).matrix()
 
 
 def _called(member: Any) -> Any:

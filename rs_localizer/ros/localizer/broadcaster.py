@@ -75,9 +75,10 @@ class Broadcaster:
         Raises:
             ValueError: without tf2_ros.
         """
-        self.tf.configure(config)
+        if what := needed(config):
+            self.tf.listen(what)
         if config.publish_tf != PublishTf.NONE and self._broadcaster is None:
-            self._broadcaster = import_tf2_ros(needed(config)).TransformBroadcaster(self._node)
+            self._broadcaster = import_tf2_ros(what).TransformBroadcaster(self._node)
         self._stop_timer()
         self._config, self._body = config, self._body or config.base_frame
         if not self._corrects:

@@ -6,6 +6,7 @@ From message to pose: ``Inputs`` takes a message, ``_take_frame`` passes it to t
     keeps the newest one. ``FrameLocalizer`` localizes it, and ``Publisher`` publishes the result.
 """
 
+import contextlib
 import functools
 import math
 from collections.abc import Collection
@@ -94,7 +95,7 @@ class Publisher:
             self._broadcaster.publish(frame)
         self._map_view.show(frame.map_frame, frames.map_points)
         if camera is not None and self._wanted(topics.CAMERA_MARKER):
-            marker = MarkerArray(markers=[camera_marker(frame, camera.view_corners)])
+            marker = MarkerArray(markers=[camera_marker(frame, camera.camera)])
             self._publishers[topics.CAMERA_MARKER].publish(marker)
         if math.isfinite(frame.estimate.integrity) and self._wanted(topics.INTEGRITY):
             self._publishers[topics.INTEGRITY].publish(integrity_message(frame))
@@ -257,7 +258,8 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
             return
         if self._needs_tf and self._frames.aid.frame != self._frames.camera_frame:
             self._needs_tf = False
-            self._broadcaster.tf.listen("the IMU")
+            with contextlib.suppress(ValueError):  # the IMU is not used then, and that is said
+                self._broadcaster.tf.listen("the IMU")
 
     def _take_state(self, item: Input, message: Any) -> None:
         """Read here what the worker uses, so that a bad message does not replace a good one."""
@@ -292,12 +294,12 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
     # -- in the worker's thread --------------------------------------------------------------
 
     def _use(self, frames: FrameLocalizer, item: Input, content: Any) -> None:
-        before = frames.map
+        before = frames.landmarks.map
         try:
             item.use(frames, content)
         except MessageError as error:
             self.refusals.add(item.refused, str(error))
-        if frames.map is not before:
+        if frames.landmarks.map is not before:
             self._say_map(frames)
 
     def _change(self, frames: FrameLocalizer, config: NodeConfig) -> None:
@@ -307,8 +309,8 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
             self.get_logger().info("new settings: the previous frames are forgotten")
 
     def _say_map(self, frames: FrameLocalizer) -> None:
-        if frames.map is not None:
-            count, frame = len(frames.map), frames.map.frame
+        if frames.landmarks.map is not None:
+            count, frame = len(frames.landmarks.map), frames.landmarks.map.frame
             self.get_logger().info(f"the map has {count} landmarks in frame {frame!r}")
 
     # -- what it says of itself --------------------------------------------------------------

@@ -77,25 +77,19 @@ class Tf:
         self._unusable = UnusableTransforms()
         self._undo = contextlib.ExitStack()
 
-    def configure(self, config: NodeConfig) -> None:
-        """Listen if these settings need it.
+    def listen(self, what: str) -> None:
+        """Listen because this needs it.
 
         Raises:
-            ValueError: without tf2_ros.
+            ValueError: without tf2_ros; whoever asks later is told, too.
         """
-        if what := needed(config):
-            self._listen(import_tf2_ros(what))
-
-    def listen(self, what: str) -> None:
-        """Listen because of what has come; without tf2_ros, whoever asks is told."""
-        try:
-            self._listen(import_tf2_ros(what))
-        except ValueError as error:
-            self._deaf = str(error)
-
-    def _listen(self, tf2_ros: Any) -> None:
         if self._buffer is not None:
             return
+        try:
+            tf2_ros: Any = import_tf2_ros(what)
+        except ValueError as error:
+            self._deaf = str(error)
+            raise
         self._errors, self._buffer, hear = tf2_ros, tf2_ros.Buffer(), self._hear
 
         class Listener(tf2_ros.TransformListener):  # type: ignore[misc]

@@ -12,6 +12,7 @@ from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray  # type: ignore[import-untyped]
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
 from rs_localizer.io.messages import make_header, make_quaternion, make_vector
 from rs_localizer.io.topics import MAP_MARKERS
 from rs_localizer.ros.node.conversion import make_message
@@ -58,13 +59,8 @@ def map_marker(frame: str, points: Array) -> Marker:
     return marker
 
 
-def camera_marker(frame: "Localized", corners: Array) -> Marker:
-    """Return the camera's view at the middle row, coloured by the trust in the pose.
-
-    Args:
-        frame: localized.
-        corners: (4,3) bearings of the image's corners, camera axes.
-    """
+def camera_marker(frame: "Localized", camera: Camera) -> Marker:
+    """Return the camera's view at the middle row, coloured by the trust in the pose."""
     doubt = frame.estimate.integrity
     color = (0.2, 0.5, 1.0)
     if math.isfinite(doubt):  # green, yellow at one half, red
@@ -73,7 +69,9 @@ def camera_marker(frame: "Localized", corners: Array) -> Marker:
     marker.ns, marker.scale.x = "camera", _LINE
     marker.pose.position = make_vector(make_message, frame.estimate.position, "Point")
     marker.pose.orientation = make_quaternion(make_message, frame.estimate.rotation.T)
-    far = _DEPTH * corners
+    width, height = np.array(camera.size) - 1.0
+    corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
+    far = _DEPTH * camera.bearings(corners)
     sides = np.stack([far, np.roll(far, -1, axis=0)], axis=1)
     rays = np.stack([np.zeros_like(far), far], axis=1)
     marker.points = _points(np.concatenate([sides, rays]).reshape(-1, 3))

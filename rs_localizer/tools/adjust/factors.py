@@ -8,8 +8,6 @@ one before lets expect. In the gyroscope's axes ``e = M rate(t + delay) + bias -
 noise of the samples must not stand beside what is estimated of ``M``, which it would make smaller.
 """
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 

@@ -15,8 +15,6 @@ seconds to tell one for each number. Of independent errors, what a second pulls 
 estimated fits its own errors, too.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import pairwise
 

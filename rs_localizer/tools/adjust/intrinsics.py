@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Intrinsics and distortion as numbers that an estimator may change: derivatives, prior, errors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Images with their correspondences, one pose each, as an adjustment takes them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar

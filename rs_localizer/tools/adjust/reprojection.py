@@ -8,8 +8,6 @@ the keypoint to another row, too, so that the error has the covariance ``s^2 A A
 Errors and derivatives are multiplied by the inverse of ``A`` and weighted by Tukey's biweight.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -12,8 +12,6 @@ of the motion is a band, if the blocks touch neighbours only, and otherwise dens
     [ C^T B ] [y] = - [h]
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial

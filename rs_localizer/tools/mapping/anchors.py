@@ -6,8 +6,6 @@ Both are seen in images beside the landmarks, and triangulated with the refined 
 take part in the adjustment, where they hold frame, size and shape of the map.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -11,8 +11,6 @@
 4. All landmarks are triangulated with that motion, and so is what gives the map its metres.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -123,7 +121,7 @@ def _frames(structure: Structure, camera: Camera) -> CameraFrames:
     frames = CameraFrames(config)
     frames.calibrate(read_camera_info(make_camera_info(camera, 0)))
     points = structure.start.points
-    frames.use_map(Map(points, np.arange(len(points)), structure.descriptors, MAP_FRAME))
+    frames.landmarks.use_map(Map(points, np.arange(len(points)), structure.descriptors, MAP_FRAME))
     return frames
 
 

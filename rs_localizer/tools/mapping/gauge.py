@@ -11,8 +11,6 @@ errors of its own orientation grow with the distance from it; held by all corner
 left is the error of the shape alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -8,8 +8,6 @@ point, to where a camera at the pose of one row of its image sees that point. Th
 keypoint stays.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 

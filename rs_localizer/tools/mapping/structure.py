@@ -8,8 +8,6 @@ own. It assumes a global shutter: the structure is bent as far as the shutter's 
 like depth, and is a start for :mod:`.refinement`. It has a scale and axes of its own.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import math

@@ -7,8 +7,6 @@ imports nothing of this package and is run by its path; it leaves a model and it
 standard output it says ``stage NAME TOTAL`` and ``step COUNT`` as it goes, at last ``result JSON``.
 """
 
-from __future__ import annotations
-
 import json
 import sqlite3
 import sys

@@ -11,8 +11,6 @@ IJCV 2014). With the motion held, each marker is mirrored about its mean line of
 its own, and compared.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -41,6 +41,11 @@ class ImuSettings:
     accelerometer_bias: float = 0.05  # m/s^2, in any direction
     time_offset: float = 0.0  # s to be added to its stamps to get the camera's time
 
+    @property
+    def variances(self) -> tuple[float, float]:
+        """Variances of an angular rate, (rad/s)^2, and of a force, (m/s^2)^2."""
+        return self.gyroscope_noise**2 * self.rate, self.accelerometer_noise**2 * self.rate
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shaken:
@@ -184,17 +189,9 @@ def write_imu(
     bag.write(TF_STATIC, mounting(lever), begin_ns)
     for i in np.flatnonzero((track.times_ns >= begin_ns) & (track.times_ns <= end_ns)).tolist():
         stamp, rate = int(track.stamps_ns[i]), track.angular_velocities[i]
-        message = make_imu(stamp, rate, track.specific_forces[i], settings)
+        force = track.specific_forces[i]
+        message = make_reading(stamp, rate, force, IMU_FRAME, settings.variances)
         bag.write(IMU_TOPIC, message, int(track.times_ns[i]))
-
-
-def make_imu(
-    stamp_ns: int, rate: Array, force: Array, settings: ImuSettings, frame: str = IMU_FRAME
-) -> Any:
-    """Make a sensor_msgs/Imu of rate (3,) rad/s and force (3,) m/s^2, without orientation."""
-    densities = (settings.gyroscope_noise, settings.accelerometer_noise)
-    gyroscope, accelerometer = (density**2 * settings.rate for density in densities)
-    return make_reading(stamp_ns, rate, force, frame, (gyroscope, accelerometer))
 
 
 def mounting(lever: Lever) -> Any:

@@ -18,7 +18,12 @@ from benchmarks.real.peers import PEERS, solve_pnp
 from benchmarks.real.recordings import Frame, Recording, read_bag
 from rs_localizer.config import CalibrationErrors, NodeConfig
 from rs_localizer.io.bags import BagWriter
-from rs_localizer.io.recording import write_frame
+from rs_localizer.io.recording import (
+    CAMERA_INFO_TOPIC,
+    CORRESPONDENCES_TOPIC,
+    make_camera_info,
+    make_correspondences,
+)
 
 TRUE, LENGTH = TrueCamera(), 8
 CAMERA, EXACT = believed(TRUE, 0.0), CalibrationErrors(0.0, 0.0, 0.0, 0.0)
@@ -37,7 +42,9 @@ def recording(frames, tmp_path_factory):
         for k in range(LENGTH):
             points, pixels = frames.seen(k, 0.1)
             stamp, ids = int(frames.stamp_ns[k]), np.arange(len(points))
-            write_frame(bag, CAMERA, stamp, points, pixels, ids)
+            bag.write(CAMERA_INFO_TOPIC, make_camera_info(CAMERA, stamp), stamp)
+            cloud = make_correspondences(stamp, points, pixels, ids)
+            bag.write(CORRESPONDENCES_TOPIC, cloud, stamp)
     return path
 
 

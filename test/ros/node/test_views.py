@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rs_localizer.core.camera import Camera
 from rs_localizer.ros.node.views import camera_marker
 
 
@@ -26,8 +27,8 @@ def test_the_camera_stands_where_it_is_and_its_colour_is_the_doubt(doubt, color)
         rotation=turn.inv().as_matrix(), position=np.array([1.0, 2.0, 3.0]), integrity=doubt
     )
     frame: Any = SimpleNamespace(map_frame="hall", stamp_ns=5 * 10**9, estimate=estimate)
-    corners = np.array([[-1, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2]], float)
-    marker = camera_marker(frame, corners / np.sqrt(6.0))
+    camera = Camera(5, 5, K=np.array([[4.0, 0.0, 2.0], [0.0, 4.0, 2.0], [0.0, 0.0, 1.0]]))
+    marker = camera_marker(frame, camera)  # which sees half a metre to each side, in one
     assert (marker.header.stamp.sec, marker.header.frame_id, marker.ns) == (5, "hall", "camera")
     q, p = marker.pose.orientation, marker.pose.position
     pose = Rotation.from_quat([q.x, q.y, q.z, q.w])
