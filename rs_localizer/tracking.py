@@ -717,7 +717,7 @@ class Tracker:
             # behind is no Gaussian's. NaN, of rounding errors, is neither.
             if -1.0 < window.surprise < _MOST_INNOVATION:
                 return window
-        start = gaussian_of(result if result.twist_known else self._at_any_speed(result), time_ns)
+        start = gaussian_of(self._at_any_speed(result), time_ns)
         alone = MotionWindow.begin(start, self.localizer.config.acceleration, share)
         return alone if track is None else replace(alone, deviations=track.window.deviations)
 

@@ -57,7 +57,6 @@ def test_topics_are_found_by_name_then_by_type():
         "map_points": "/map_points",
         "keypoints": "/odd",
     }
-    assert given.inputs["/odd"] is INPUTS["keypoints"]
 
 
 def test_what_is_not_there_or_not_clear_is_said():
