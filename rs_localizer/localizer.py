@@ -546,6 +546,5 @@ class Localizer:
             if parts.part is not part:
                 effect = effect_of(parts.part)
         effect = widened(effect, posterior)
-        effect = effect._replace(covariance=effect.covariance + other)
         estimate = estimate_of(observed, posterior, best.samples, effect, tracked)
-        return replace(estimate, left_out=odd.notice) if odd.notice else estimate
+        return replace(estimate, left_out=odd.notice, moved_covariance=other)

@@ -560,3 +560,22 @@ def test_what_creeps_away_does_not_take_the_camera_along():
         found = tracker.localize(ns(t), *(np.concatenate(each) for each in zip(*seen, strict=True)))
         errors.append(np.linalg.norm(still.error(found, t)[3:6]) if found else np.inf)
     assert np.max(errors[-20:]) < 0.02
+
+
+@pytest.mark.parametrize("single", [False, True])
+def test_a_poster_that_hangs_upside_down_silences_no_frame(single):
+    """Either the poster was turned, or all else: the pose of most points is told, and the doubt."""
+    rng, tracker = np.random.default_rng(3), tracker_of()
+    place = np.column_stack([rng.uniform(-0.4, 0.4, (40, 2)), np.full(40, 4.0)])
+    turned = place * [-1.0, -1.0, 1.0]
+    for k, t in enumerate(times(6)):
+        points, pixels = HAND.frame(t, MAP, 120, 0.5, seed=k)
+        seen = HAND.pixels(t, turned) + 0.5 * rng.normal(size=(40, 2))
+        frame = np.concatenate([points, place[:16]]), np.concatenate([pixels, seen[:16]])
+        found = tracker.localizer.localize(*frame) if single else tracker.localize(ns(t), *frame)
+        assert found, str(found)
+        assert "a pose of their own" in found.left_out
+        error = HAND.error(found, t)
+        assert np.linalg.norm(error[:3]) < 0.005
+        assert squared(error[:6], found.covariance) < INSIDE_6
+        assert np.degrees(found.orientation_deviation) > 4.0

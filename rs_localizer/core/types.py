@@ -60,6 +60,11 @@ class Estimate(Motion):
     undetected_covariance: Array = field(
         default_factory=np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)).copy
     )
+    # (12,12) part of ``covariance`` that points with a motion of their own cause: either they or
+    # all others lie elsewhere than the map says
+    moved_covariance: Array = field(
+        default_factory=np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)).copy
+    )
     still_deviation: float = math.inf  # rad, orientation_deviation if the motion were known
     # (k,3) rad: coefficients of the in-frame rotation, vibration (rs_localizer.core.shake)
     shake: Array = field(default_factory=np.zeros((0, 3)).copy)
@@ -81,7 +86,8 @@ class Estimate(Motion):
     def covariance(self) -> Array:
         """Covariance (12,12) of pose and velocities at tau = 0."""
         own = self.joint_covariance[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
-        return own + self.calibration_covariance + self.undetected_covariance
+        frame = self.undetected_covariance + self.moved_covariance
+        return own + self.calibration_covariance + frame
 
     def with_joint_covariance(self, joint_covariance: Array, **fields: Any) -> Self:
         """Return the estimate with a covariance that other frames have determined.
@@ -207,6 +213,7 @@ class Estimate(Motion):
             joint_covariance=joint,
             calibration_covariance=shared @ self.calibration_covariance @ shared.T,
             undetected_covariance=shared @ self.undetected_covariance @ shared.T,
+            moved_covariance=shared @ self.moved_covariance @ shared.T,
             shake=np.zeros((0, 3)),
             time_ns=self.time_ns + round(1e9 * seconds),
         )

@@ -141,12 +141,14 @@ def uncertain(estimate: Estimate) -> Failure | None:
     """Return why an estimate is too uncertain to be published, or None.
 
     What points do not tell because the camera may move, its covariance says: a global-shutter
-    estimator, which takes the camera for one at rest, would publish that pose.
+    estimator, which takes the camera for one at rest, would publish that pose. Nor does it refuse
+    one that most points tell, and others, which may have been moved, deny.
     """
     still, most = estimate.still_deviation, MOST_TURN
-    if np.trace(estimate.covariance[TURN, TURN]) <= most**2:  # less than that about any axis
+    turn = (estimate.covariance - estimate.moved_covariance)[TURN, TURN]
+    if np.trace(turn) <= most**2:  # less than that about any axis
         return None
-    deviation = estimate.orientation_deviation
+    deviation = math.sqrt(np.linalg.eigvalsh(turn)[-1])
     if deviation <= most or (still <= most and deviation <= _OPEN * most):
         return None
     return Failure(
