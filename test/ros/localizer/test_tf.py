@@ -20,7 +20,7 @@ from rs_localizer.io.outputs import BodyPose, Localized
 from rs_localizer.io.transforms import Transform, TransformError
 from rs_localizer.pipeline.given_pose import GivenPose
 from rs_localizer.ros.localizer.broadcaster import Broadcaster
-from rs_localizer.ros.localizer.tf import check
+from rs_localizer.ros.localizer.tf import Tf, check
 
 from ..node.test_worker import waits  # noqa: TID252 - Python has a package "test"
 from .robot import tf2_ros
@@ -171,6 +171,11 @@ def test_without_tf2_ros_only_what_needs_it_is_refused(monkeypatch):
         check(NodeConfig(base_frame="base_link"))
     with pytest.raises(ValueError, match=f"^publish_tf map_to_odom needs {package}$"):
         check(NodeConfig(publish_tf="map_to_odom"))
+    tf = Tf(None, print)
+    with pytest.raises(ValueError, match=f"^the IMU needs {package}$"):
+        tf.listen("the IMU")
+    with pytest.raises(TransformError, match=f"^the IMU needs {package}$"):
+        tf.lookup("camera", "imu", None)
 
 
 @pytest.mark.parametrize("other", ["forget", "_tick"])
