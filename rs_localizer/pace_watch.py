@@ -42,7 +42,7 @@ class PaceWatch:
         """Forget all frames."""
         self._places: deque[tuple[int, Array, float]] = deque()  # ns, m, m^2
         self._scale: str | None = ""  # what is wrong with that of the map; None: not known yet
-        self._returned, self._apart = 0, ""
+        self._looked_ns, self._returned, self._apart = -math.inf, 0, ""
 
     @property
     def is_odd(self) -> bool:
@@ -59,16 +59,18 @@ class PaceWatch:
         """How the poses contradict one camera in metres, in one sentence."""
         return self._scale or (self._apart if self._returned >= _ALTERNATING else "")
 
-    def returns(self, is_back: bool, away: Array) -> None:
-        """Take whether a frame jumped away from the last one, and back to the one before it.
+    def returns(self, away: Array | None) -> None:
+        """Take a frame that jumped back to the one before the last, or None.
 
         ``away`` (6,) is the step from the last one, rad and m.
         """
-        self._returned = self._returned + 1 if is_back else 0
-        turn, move = (float(np.linalg.norm(part)) for part in (away[:3], away[3:]))
+        self._returned = 0 if away is None else self._returned + 1
+        if away is None:
+            return
+        turn, move = math.degrees(np.linalg.norm(away[:3])), float(np.linalg.norm(away[3:]))
         self._apart = (
-            f"images alternate between two places, {move:.2g} m and {math.degrees(turn):.2g} deg "
-            "apart: are they those of two cameras? Each needs a Tracker, or both a Rig"
+            f"images alternate between two places, {move:.2g} m and {turn:.2g} deg apart: are they "
+            "those of two cameras? Each needs a Tracker, or both a Rig"
         )
 
     def add(
@@ -86,10 +88,11 @@ class PaceWatch:
         if places and not 0.0 <= 1e-9 * (time_ns - places[-1][0]) < _LONGEST_STEP:
             places.clear()
             self._scale = ""
-        depth = 0.0
-        if not places or 1e-9 * (time_ns - places[-1][0]) > _APART:
-            ahead = (points[found.inliers] - found.position) @ found.rotation[2]
-            depth = float(np.median(ahead)) if len(ahead) else 0.0
+        if 0.0 <= 1e-9 * (time_ns - self._looked_ns) <= _APART:
+            return
+        self._looked_ns = time_ns
+        ahead = (points[found.inliers] - found.position) @ found.rotation[2]
+        depth = float(np.median(ahead)) if len(ahead) else 0.0
         if depth > _NEAR and (free := alone()):
             places.append((time_ns, free.position, free.covariance[3:6, 3:6].trace()))
             while 1e-9 * (time_ns - places[0][0]) > _WINDOW:

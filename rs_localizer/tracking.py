@@ -475,12 +475,11 @@ class Tracker:
             self._parts.discard()
 
     def _compare_pace(self, time_ns: int, result: Estimate, jumped: bool, *frame: Any) -> None:
-        if self._track is not None:
-            away = step_from(self._track.estimate, result)[POSE]
-            before = self._seen[-2].found if len(self._seen) > 1 else None
-            back = step_from(before, result)[POSE] if before else away
-            is_back = jumped and np.linalg.norm(back) < _BACK * np.linalg.norm(away)
-            self.pace.returns(bool(is_back), away)
+        away, before = None, self._seen[-2].found if len(self._seen) > 1 else None
+        if jumped and self._track is not None and before:
+            step, back = (step_from(one, result)[POSE] for one in (self._track.estimate, before))
+            away = step if np.linalg.norm(back) < _BACK * np.linalg.norm(step) else None
+        self.pace.returns(away)
 
         def alone() -> Estimate | Failure:
             if not result.tracked:
