@@ -31,6 +31,7 @@ sizes, and poses between images by what that makes.
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -263,16 +264,18 @@ class MotionWindow:
         whole.state[STATE_TRANSLATION] -= rotation_of(whole.state) @ centre
         return Gaussian(self.times[row], whole.state, whole.covariance)
 
-    def foreseen(self, time_ns: int) -> Gaussian:
+    def foreseen(self, time_ns: int, readout_share: float) -> Gaussian:
         """Return the motion that an image at a time after the last frame may have.
 
         Its accelerations may have grown: what the image tells joins the window without this.
         """
-        deviations = enlarged(self.deviations, self.configured, _GROWN[-1])
-        return replace(self, deviations=deviations).after(time_ns)
+        grown = enlarged(self.deviations, self.configured, _GROWN[-1])
+        return self._ahead(time_ns, grown, readout_share, FADING)
 
-    def after(self, time_ns: int, lasting: float = FADING) -> Gaussian:
-        """Return the motion at a time after the last frame.
+    def _ahead(
+        self, time_ns: int, deviations: Array, readout_share: float, lasting: float
+    ) -> Gaussian:
+        """Return the motion after the last frame, with deviations (4,) of accelerations.
 
         ``lasting`` is the time (s) in which the accelerations fade that its covariance is of.
         """
@@ -280,7 +283,7 @@ class MotionWindow:
         if seconds == 0.0:
             return last
         state, transport, added = _predicted(
-            last.state, seconds, self.deviations, self.readout_share, float(lasting)
+            last.state, seconds, deviations, readout_share, lasting
         )
         return Gaussian(time_ns, state, transport @ last.covariance @ transport.T + added)
 
@@ -290,7 +293,7 @@ class MotionWindow:
         if time_ns < times[0]:
             return None
         if time_ns > times[-1]:
-            ahead = self.after(time_ns, _LASTING)
+            ahead = self._ahead(time_ns, self.deviations, self.readout_share, _LASTING)
             return ahead._replace(covariance=_FEW * ahead.covariance)
         if time_ns in times:
             return self.before(len(times) - 1 - times.index(time_ns))
@@ -331,7 +334,7 @@ class MotionWindow:
         learnt = found[0].deviations
         found += [solved(told, learnt, 0, grown) for grown in _GROWN]
         apart, away = _between(seconds, informations)
-        for swing in _SWINGS if np.median(apart) > _SLOW else ():
+        for swing in _SWINGS if statistics.median(apart.tolist()) > _SLOW else ():
             beside = _Swinging.of(states, told, swing * np.outer(apart, self.configured), away)
             found.append(beside.of_images(solved(beside.told, learnt, 0, 1.0)))
         return tuple(found)
