@@ -27,7 +27,7 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.moved_part import keys_of, likeness
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.estimation.window import acceleration_covariance, step_from
-from rs_localizer.native import entry, kernel
+from rs_localizer.native import entry
 
 NAMES = "apart", "spread", "count", "innovation"
 """Names of the numbers of a frame."""
@@ -77,17 +77,11 @@ def _spread(points: Array2, kept: BoolArray1) -> float:
     """Return the logarithm of how far inliers spread in the map, beside all points (n,3)."""
     if np.sum(kept) < 3:
         return -3.0
-    inner, outer = max(_extent(points[kept]), 1e-12), max(_extent(points), 1e-12)
-    return min(max(0.5 * math.log(inner / outer), -3.0), 1.0)
-
-
-@kernel
-def _extent(points: Array) -> float:
-    """Return the sum of the variances of points (n,3) along the axes."""
-    total = 0.0
+    inner = outer = 1e-12
     for axis in range(3):
-        total += float(np.var(points[:, axis]))
-    return total
+        inner += float(np.var(points[kept, axis]))
+        outer += float(np.var(points[:, axis]))
+    return min(max(0.5 * math.log(inner / outer), -3.0), 1.0)
 
 
 def _innovation(estimate: Estimate, prior: Prior, added: Array) -> float:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from functools import lru_cache, partial
 from typing import Any
 
@@ -26,7 +26,7 @@ from rs_localizer.core.state import (
     VELOCITIES,
     step_between,
 )
-from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.core.types import Estimate, Failure, altered
 from rs_localizer.estimation.acceptance import (
     estimate_of,
     noise_fills,
@@ -64,7 +64,6 @@ from rs_localizer.estimation.prior import (
     knows_speed,
     of_frame,
     state_in,
-    unchecked,
     with_motion,
 )
 from rs_localizer.estimation.robust import GATE, WIDEST_GATE, best_motion
@@ -110,7 +109,7 @@ def _or_else(found: Estimate, tracked: Estimate) -> Estimate:
     """
     step = step_from(found, tracked)[:MOTION_PARAMETERS]
     moment = found.calibration_covariance + np.outer(step, step)
-    return replace(found, calibration_covariance=moment)
+    return altered(found, calibration_covariance=moment)
 
 
 def _contradiction(found: Estimate, prior: Prior) -> str:
@@ -330,7 +329,7 @@ class Localizer:
         if prior is not None and prior.motion is not None:
             tracked = self._track(observed, prior, expected_share)
             if tracked and not _is_bent(tracked):
-                return replace(tracked, tracked=True)
+                return altered(tracked, tracked=True)
         found = self._searched(observed)
         if not tracked or prior is None:
             return found
@@ -339,7 +338,7 @@ class Localizer:
                 return found
             if not knows_speed(observed.terms, prior):
                 return _or_else(found, tracked)
-        return replace(tracked, tracked=True)
+        return altered(tracked, tracked=True)
 
     def _searched(self, observed: Observed) -> Estimate | Failure:
         # 3. A global-shutter start, then hypotheses of the solver (LO-RANSAC).
@@ -373,12 +372,12 @@ class Localizer:
         posterior = self._settle(observed, best, terms)
         result = self._accept(observed, best, posterior, prior)
         if result and np.count_nonzero(result.inliers) < (
-            _STILL_TRACKED * expected_share * observed.observations.count
+            _STILL_TRACKED * expected_share * len(observed.observations)
         ):
             return Failure(
                 Reason.TOO_FEW_INLIERS,
                 f"{np.count_nonzero(result.inliers)} inliers near the prior motion, "
-                f"{expected_share:.0%} of {observed.observations.count} were expected",
+                f"{expected_share:.0%} of {len(observed.observations)} were expected",
             )
         return result
 
@@ -410,7 +409,7 @@ class Localizer:
         )  # fmt: skip
         observations = observed.observations
         if not self._full:
-            seen = observations.packed, observations.count
+            seen = observations.packed, len(observations)
             return Posterior(*best_motion(*seen, best.state, terms, gate))._replace(gate=gate)
         threshold, most, rolling = gate, _WIDEST * gate, self._solver.rolling_shutter
         searched = terms is observed.terms and rolling
@@ -478,7 +477,7 @@ class Localizer:
         covariance = np.array(prior.covariance, float)
         covariance[POSE] = covariance[:, POSE] = 0.0
         np.fill_diagonal(covariance[POSE, POSE], np.inf)
-        of_velocities = unchecked(prior, covariance=covariance)
+        of_velocities = altered(prior, covariance=covariance)
         turned = observed.rotation is not None
         return with_motion(observed.terms, of_velocities, observed.centre, turned)
 
@@ -529,4 +528,4 @@ class Localizer:
         effect = widened(effect, posterior)
         effect = effect._replace(covariance=effect.covariance + other)
         estimate = estimate_of(observed, posterior, best.samples, effect, tracked)
-        return replace(estimate, left_out=odd.notice) if odd.notice else estimate
+        return altered(estimate, left_out=odd.notice) if odd.notice else estimate

@@ -39,7 +39,7 @@ from rs_localizer.core.state import (
     TURN,
     VELOCITIES,
 )
-from rs_localizer.core.types import Estimate, Failure, roughness
+from rs_localizer.core.types import Estimate, Failure, altered, roughness
 from rs_localizer.estimation.points import FrameSights
 from rs_localizer.estimation.prior import state_in
 from rs_localizer.estimation.projection import linearized
@@ -165,8 +165,7 @@ class _Way(NamedTuple):
         others = before, after
         times = 1e-9 * np.array([look.time_ns - now.time_ns for look in others])
         ways = np.array([step_from(now.found, look.found)[POSE] for look in others])
-        noise, more = (look.found.joint_covariance[POSE, POSE] for look in others)
-        noise = noise + more
+        noise = before.found.joint_covariance[POSE, POSE] + after.found.joint_covariance[POSE, POSE]
         way = ways[1] - ways[0]
         try:
             moves = way @ np.linalg.solve(noise, way) > _LEAST_MOTION
@@ -252,7 +251,7 @@ class ShutterWatch:
             calibration[TURN, TURN] += sway**2 * np.eye(3)
             longer = self.error / self._usual * own
             calibration[VELOCITIES, VELOCITIES] += np.outer(longer, longer)
-            found = replace(found, calibration_covariance=calibration)
+            found = altered(found, calibration_covariance=calibration)
         if not (self._reversed or self._across):
             return found
         steps, velocities = [np.r_[np.zeros(6), -2.0 * own]], np.r_[np.zeros(6), own]

@@ -38,13 +38,13 @@ from rs_localizer.core.state import (
     TURN,
     VELOCITIES,
 )
-from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.core.types import Estimate, Failure, altered
 from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.estimation.frames_together import CamerasTogether
 from rs_localizer.estimation.known_rotation import Aid, Foretold, LastFrame
 from rs_localizer.estimation.moved_part import MovedPart, MovedParts
 from rs_localizer.estimation.points import FrameSights
-from rs_localizer.estimation.prior import Prior, beside, predicted, unchecked
+from rs_localizer.estimation.prior import Prior, beside, predicted
 from rs_localizer.estimation.window import (
     FADING,
     LENGTH,
@@ -55,8 +55,8 @@ from rs_localizer.estimation.window import (
     gaussian_of,
     predicted_estimate,
     step_from,
+    swing_of,
     told_of,
-    unshaken,
 )
 from rs_localizer.integrity import Integrity
 from rs_localizer.lens_watch import LensWatch
@@ -445,7 +445,7 @@ class Tracker:
                 result = self.lens.widened(result, *seen)
             result = self.shutter.widened(result)
             if self.remembers_motion:
-                result = self._covering(replace(result, time_ns=time_ns))
+                result = self._covering(altered(result, time_ns=time_ns))
                 self._remember(time_ns, told, result, context)
         self._keep(_Seen(time_ns, result, sights))
         self._images.add(time_ns, points, pixels)
@@ -635,7 +635,7 @@ class Tracker:
             residuals = seen.sights.residuals(found)
             if isinstance(found.residuals, ByCamera):
                 residuals = found.residuals.like(residuals)
-            seen.found = replace(found, residuals=residuals, inliers=residuals <= seen.gate)
+            seen.found = altered(found, residuals=residuals, inliers=residuals <= seen.gate)
 
     def _covering(self, result: Estimate) -> Estimate:
         """Return the estimate with velocities as uncertain as frames show them, if rows may not.
@@ -668,7 +668,7 @@ class Tracker:
         before, self._judged_ns = self._judged_ns, time_ns  # of images that have no track, too
         gone = time_ns - before if before is not None else 0
         later = 1e-9 * gone if gone > 0 else math.inf
-        return replace(result, integrity=self._integrity.add(numbers, later))
+        return altered(result, integrity=self._integrity.add(numbers, later))
 
     def _prior(
         self, time_ns: int, rotation: RotationPrior | None, span: float | None,
@@ -683,7 +683,7 @@ class Tracker:
             prior = replace(prior, covariance=_UNKNOWN, of_rest=rest)
         if rotation is None:
             if prior is not None and self._track is not None:
-                prior = unchecked(prior, of_vibration=self._track.vibrations)
+                prior = altered(prior, of_vibration=self._track.vibrations)
             return prior
         return None if prior is None else beside(prior, rotation)
 
@@ -698,7 +698,7 @@ class Tracker:
             # Beside an aid they are of another kind: of what it leaves.
             is_new = vibrations.size and not result.aided
             vibrations = track.vibrations + (vibrations if is_new else 0.0)
-        window, swing = self._window(time_ns, told, result, context), unshaken(result)[2]
+        window, swing = self._window(time_ns, told, result, context), swing_of(result)
         self._track = _Track(result, time_ns, share, window, swing, _REMEMBERED * vibrations)
 
     def _window(

@@ -123,7 +123,7 @@ def calibration_effect(
         chosen = chosen[np.linspace(0, found - 1, _MANY).astype(np.int64)]
     some = observations.only(chosen)
     state, tau = posterior.state, some.tau
-    lines = linearized(some.packed, some.count, state, shake_at(tau, posterior.shake))
+    lines = linearized(some.packed, len(some), state, shake_at(tau, posterior.shake))
     by_motion, image = lines.by_motion, lines.image
     rotation, rays = observed.rotation, image
     if rotation is not None:  # which was taken out
@@ -231,11 +231,9 @@ def _columns(camera: Camera, towards: Array, deviation: CalibrationErrors) -> Ar
     corner_pixels = corner * camera.focal_length / camera.binning[0]
     lens = pinhole(camera)
     if lens is not None:  # the same, for less
-        columns: Array = _by_pinhole(
-            towards, lens[0], lens[2], float(deviation.principal_point),
-            float(deviation.focal_length), deviation.distortion / (corner_pixels * corner**2),
-            float(deviation.aspect_ratio),
-        )  # fmt: skip
+        by_k1 = deviation.distortion / (corner_pixels * corner**2)
+        sizes = deviation.principal_point, deviation.focal_length, by_k1, deviation.aspect_ratio
+        columns: Array = _by_pinhole(towards, lens[0], lens[2], np.array(sizes))
         return columns
     columns = np.zeros((len(towards), 2, _ERRORS))
     columns[:, 0, 0] = columns[:, 1, 1] = deviation.principal_point
@@ -249,21 +247,18 @@ def _columns(camera: Camera, towards: Array, deviation: CalibrationErrors) -> Ar
 
 
 @entry
-def _by_pinhole(
-    rays: Array2, focal: Array1, lens: Array1, principal_point: float, focal_length: float,
-    distortion: float, aspect_ratio: float,
-) -> Array:  # fmt: skip
-    """Return shifts as :func:`_columns` through a lens of :func:`pinhole`; distortion is of k1."""
+def _by_pinhole(rays: Array2, focal: Array1, lens: Array1, sizes: Array1) -> Array:
+    """Return shifts as :func:`_columns` through a lens of :func:`pinhole`, by errors (4,)."""
     columns = np.zeros((len(rays), 2, _ERRORS))
     pixels, _ = projected_by(rays, focal, np.zeros(2), lens)
     for i in range(len(rays)):
         square = np.sum(rays[i] ** 2)
         slope = square / (1.0 + square * (lens[5] + square * (lens[6] + square * lens[7])))
         for axis in range(2):
-            columns[i, axis, axis] = principal_point
-            columns[i, axis, 2] = focal_length * pixels[i, axis]
-            columns[i, axis, 3] = distortion * focal[axis] * rays[i, axis] * slope
-            columns[i, axis, 4] = aspect_ratio * pixels[i, axis] * _ASPECT[axis]
+            columns[i, axis, axis] = sizes[0]
+            columns[i, axis, 2] = sizes[1] * pixels[i, axis]
+            columns[i, axis, 3] = sizes[2] * focal[axis] * rays[i, axis] * slope
+            columns[i, axis, 4] = sizes[3] * pixels[i, axis] * _ASPECT[axis]
     return columns
 
 

@@ -210,23 +210,18 @@ class Observations:
     def __len__(self) -> int:
         return len(self.points)
 
-    @property
-    def count(self) -> int:
-        """Number of the points."""
-        return len(self.points)
-
     def lens_of(self, lenses: IntArray | None) -> IntArray | None:
         """Return which camera of a rig sees each point (n,), by that of each side; None: one."""
         return None if lenses is None else lenses[self.camera]
 
     def squared_errors(self, state: Array) -> Array:
         """Return squared reprojection errors (n,) in raw pixels."""
-        errors: Array = squared_errors(self.packed, self.count, state)
+        errors: Array = squared_errors(self.packed, len(self), state)
         return errors
 
     def within(self, state: Array, distance: float) -> BoolArray:
         """Return a mask (n,) of points that are reprojected to within a distance (px)."""
-        near: BoolArray = squared_errors(self.packed, self.count, state) < distance**2
+        near: BoolArray = squared_errors(self.packed, len(self), state) < distance**2
         return near
 
     def median_depth(self, state: Array, chosen: BoolArray) -> float:

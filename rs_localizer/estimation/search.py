@@ -275,7 +275,7 @@ def search(
     score, final, noise = hypotheses.score_scale, hypotheses.final_scale, hypotheses.noise
     best, inlier_ratios, drawn = start, None, [0] * len(pools)
     rotations, shares = mounts.axes @ rotation, [*accumulate(pool.share for pool in pools)]
-    bar = observations.count * score**2
+    bar = len(observations) * score**2
     left = hypotheses.most if pools else 0
     while left > 0:
         samples = np.empty((min(hypotheses.block, left), solver.sample_size), np.int64)
@@ -371,7 +371,7 @@ class MotionSearch:
     def _global_shutter(self, observed: Observed, most: int) -> Candidate:
         """Find a pose that fits all rows roughly, with a wide threshold."""
         observations = observed.observations
-        every, size = np.ones(observations.count, np.bool_), self._start.sample_size
+        every, size = np.ones(len(observations), np.bool_), self._start.sample_size
         pools = pools_of(observations, size, every, observed.ranking, False)
         starts = self._starts._replace(most=most)
         return search(observed, starts, held_terms(), pools, np.eye(3), NOTHING)
