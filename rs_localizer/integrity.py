@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import Acceleration
-from rs_localizer.core.arrays import Array, Array2, BoolArray
+from rs_localizer.core.arrays import Array, Array2, BoolArray, BoolArray1
 from rs_localizer.core.state import POSE
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.moved_part import keys_of, likeness
@@ -56,34 +56,32 @@ _BY_CHANCE, _MOST_LANDMARKS = 1e-8, 20_000
 _MOST_ODDS = 8.0
 
 
-def _together(points: Array, kept: BoolArray) -> float:
+@entry
+def _together(points: Array2, kept: BoolArray1) -> float:
     """Return how far inliers and outliers cluster in the map, in deviations of chance."""
-    chosen = np.linspace(0, len(points) - 1, min(len(points), _MOST)).astype(int)
-    points, kept = points[chosen], kept[chosen]
-    count, share = len(points), float(np.mean(kept)) if len(points) else 1.0
-    if count <= 2 * _NEIGHBOURS or not 0.0 < share < 1.0:
+    count = min(len(points), _MOST)
+    if count <= 2 * _NEIGHBOURS:
         return 0.0
-    alike = likeness(points, kept.astype(np.float64) - share, _NEIGHBOURS)
-    alike /= share * (1.0 - share)  # Moran's I
+    chosen = np.arange(count) * (len(points) - 1) // (count - 1)
+    points, some = points[chosen], kept[chosen].astype(np.float64)
+    share = float(np.mean(some))
+    if not 0.0 < share < 1.0:
+        return 0.0
+    alike = likeness(points, some - share, _NEIGHBOURS) / (share * (1.0 - share))  # Moran's I
     expected, deviation = -1.0 / (count - 1.0), math.sqrt(1.5 / (count * _NEIGHBOURS))
     return min(max((alike - expected) / deviation, -3.0), 15.0)
 
 
-def _spread(kept: Array, every: Array) -> float:
-    """Return the logarithm of how far inliers (m,3) spread in the map, beside all points (n,3)."""
-    if len(kept) < 3:
-        return -3.0
-    inner, outer = (max(_extent(each), 1e-12) for each in (kept, every))
-    return min(max(0.5 * math.log(inner / outer), -3.0), 1.0)
-
-
 @entry
-def _extent(points: Array2) -> float:
-    """Return the sum of the variances of points (n,3) along the axes."""
-    total = 0.0
+def _spread(points: Array2, kept: BoolArray1) -> float:
+    """Return the logarithm of how far inliers spread in the map, beside all points (n,3)."""
+    if np.sum(kept) < 3:
+        return -3.0
+    inner = outer = 1e-12
     for axis in range(3):
-        total += float(np.var(points[:, axis]))
-    return total
+        inner += float(np.var(points[kept, axis]))
+        outer += float(np.var(points[:, axis]))
+    return min(max(0.5 * math.log(inner / outer), -3.0), 1.0)
 
 
 def _innovation(estimate: Estimate, prior: Prior, added: Array) -> float:
@@ -117,7 +115,7 @@ class SeenLandmarks:
         place = [places.setdefault(key, len(places)) for key in keys.tolist()]
         if len(places) >= len(self._counts):  # twice as many, so that few are copied
             self._counts = np.concatenate([self._counts, np.zeros((len(places), 2))])
-        self._counts[place] += np.column_stack([np.ones(len(keys)), kept])
+        self._counts[place] += np.stack([np.ones(len(keys)), kept], axis=1)
 
     def stale(self, keys: Array) -> BoolArray:
         """Return which landmarks, by key, were seen too often to be unmatched by chance."""
@@ -175,7 +173,7 @@ class Integrity:
         outliers = (len(kept) - inliers + 1.0) / (len(kept) + 2.0)
         clusters = _together(every, kept) * outliers  # less, if few cluster: a person in view
         few = math.log(max(inliers - 6.0, 1.0))
-        return np.array([clusters, _spread(every[kept], every), few, innovation])
+        return np.array([clusters, _spread(every, kept), few, innovation])
 
     def add(self, numbers: Array, seconds: float) -> float:
         """Return the probability that the pose is wrong, after a frame with these numbers (4,).

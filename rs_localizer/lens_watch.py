@@ -152,7 +152,7 @@ class LensWatch:
         np.fill_diagonal(covariance[POSE, POSE], np.inf)
         away = depth * (camera.focal_length / given.focal_length - 1.0)
         motion = replace(found, translation=found.translation + np.array([0.0, 0.0, away]))
-        there = self._other.find(points, pixels, prior=predicted(motion, covariance))
+        there = self._other.find(self._other.sights(points, pixels), predicted(motion, covariance))
         if there:
             turn = so3.log(np.ascontiguousarray(found.rotation @ there.rotation.T))
             off = np.r_[

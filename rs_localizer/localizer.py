@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from functools import lru_cache, partial
 from typing import Any
 
@@ -17,9 +17,8 @@ from rs_localizer.config import LocalizerConfig, RefinementKind, localizer_confi
 from rs_localizer.core.arrays import Array, instance, real
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
-from rs_localizer.core.rig import Exposure, Rig, RigEstimate
+from rs_localizer.core.rig import Rig, RigEstimate
 from rs_localizer.core.rotation_prior import RotationPrior
-from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import (
     MOTION_PARAMETERS,
     PARAMETERS,
@@ -27,7 +26,7 @@ from rs_localizer.core.state import (
     VELOCITIES,
     step_between,
 )
-from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.core.types import Estimate, Failure, altered
 from rs_localizer.estimation.acceptance import (
     estimate_of,
     noise_fills,
@@ -49,6 +48,7 @@ from rs_localizer.estimation.left_out import BENT, SAMPLE, LeftOut, by_chance, l
 from rs_localizer.estimation.moved_part import MovedParts
 from rs_localizer.estimation.points import (
     NEAREST,
+    FrameSights,
     Observed,
     checked,
     checked_of_rig,
@@ -64,10 +64,8 @@ from rs_localizer.estimation.prior import (
     knows_speed,
     of_frame,
     state_in,
-    unchecked,
     with_motion,
 )
-from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.robust import GATE, WIDEST_GATE, best_motion
 from rs_localizer.estimation.search import Candidate, MotionSearch, generator
 from rs_localizer.estimation.window import step_from
@@ -111,7 +109,7 @@ def _or_else(found: Estimate, tracked: Estimate) -> Estimate:
     """
     step = step_from(found, tracked)[:MOTION_PARAMETERS]
     moment = found.calibration_covariance + np.outer(step, step)
-    return replace(found, calibration_covariance=moment)
+    return altered(found, calibration_covariance=moment)
 
 
 def _contradiction(found: Estimate, prior: Prior) -> str:
@@ -230,12 +228,11 @@ class Localizer:
                 f"refinement {self.config.refinement} knows the points alone: neither a prior nor "
                 "a rotation"
             )
-        found = self.accepted(
-            self.find(points, pixels, scores, prior, expected_share, rotation, stamps)
-        )
+        sights = self.sights(points, pixels, scores, stamps)
+        found = self.accepted(self.find(sights, prior, expected_share, rotation))
         measured = prior is not None and not (prior.gravity is prior.angular_velocity is None)
         if prior is not None and measured and (not found or _is_bent(found)):
-            alone = self.localize(points, pixels, scores, rotation=rotation, stamps=stamps)
+            alone = self.accepted(self.find(sights, rotation=rotation))
             if alone and not _is_bent(alone):
                 return Failure(Reason.PRIOR, _contradiction(alone, prior))
         return found
@@ -249,21 +246,18 @@ class Localizer:
 
     def find(
         self,
-        points: ArrayLike | Mapping[str, Sequence[ArrayLike]],
-        pixels: ArrayLike | None = None,
-        scores: ArrayLike | None = None,
+        sights: FrameSights,
         prior: Prior | None = None,
         expected_share: float = 0.5,
         rotation: RotationPrior | None = None,
-        stamps: Mapping[str, float] | None = None,
         error_modes: LandmarkErrors | None = None,
         parts: MovedParts | None = None,
     ) -> Estimate | Failure:
         """Localize as :meth:`localize`, however uncertain: the next frames may know better.
 
-        ``error_modes`` are those of the map of these points, if it has them, and ``parts`` watches
-        whether parts of it have moved; they enter covariances. Arguments that ``refinement`` does
-        not use are ignored.
+        ``sights`` are of :meth:`sights`, ``error_modes`` those of the map of these points, if it
+        has them, and ``parts`` watches whether parts of it have moved; they enter covariances.
+        Arguments that ``refinement`` does not use are ignored.
         """
         if not self._full:
             prior = rotation = None
@@ -271,14 +265,15 @@ class Localizer:
             instance("prior", prior, Prior)
             self._check_rate(prior)
         real("expected_share", expected_share, "between 0 and 1", 0.0, 1.0)
-        exposure, counts, points, pixels, scores = self._sights(points, pixels, scores, stamps)
+        # 1. What can be used: finite, distinct, inside the image; packed relative to its median.
+        exposure, counts, points, pixels, scores, usable, observations = sights
         if rotation is not None:
             instance("rotation", rotation, RotationPrior)
             if not exposure.alone:
                 raise ValueError("a known rotation is that of a camera alone, not of a rig")
             exposure = exposure.ahead()
-        # 1. What can be used: finite, distinct, inside the image; packed relative to its median.
-        usable = find_usable(exposure, points, pixels, counts, rotation)
+            usable = find_usable(exposure, points, pixels, counts, rotation)
+            observations = packed(exposure, points, usable)
         failure = unfit(exposure, pixels, usable, self.config.min_inliers)
         if failure is not None:
             return failure
@@ -287,8 +282,8 @@ class Localizer:
             ranking = np.argsort(-scores[usable.indices], kind="stable")
         terms, assumed = of_frame(*self._assume(exposure.span), prior, rotation)
         found = self._found(Observed(
-            packed(exposure, points, usable), ranking, terms, generator(self.config.seed), assumed,
-            exposure, points, usable, rotation, error_modes, parts,
+            observations, ranking, terms, generator(self.config.seed), assumed, exposure, points,
+            usable, rotation, error_modes, parts,
         ), prior, expected_share)  # fmt: skip
         return found if self._alone or not found else RigEstimate.of(found, exposure, counts)
 
@@ -304,22 +299,27 @@ class Localizer:
                 "rad/s, or in degrees? Multiply rad/s by the readout time"
             )
 
-    def _sights(
-        self, points: Any, pixels: Any, scores: Any, stamps: Mapping[str, float] | None
-    ) -> tuple[Exposure, Sequence[int], Array, Array, Array | None]:
-        """Return sights as :func:`checked_of_rig`, for a single camera or a rig."""
+    def sights(
+        self, points: Any, pixels: Any = None, scores: Any = None,
+        stamps: Mapping[str, float] | None = None,
+    ) -> FrameSights:  # fmt: skip
+        """Check and pack the points of a frame; arguments and errors are of :meth:`localize`."""
         if self._alone:
             if isinstance(points, Mapping) or stamps is not None:
                 raise ValueError("images by names, and their stamps, are those of a Rig")
             points, pixels, scores = checked(points, pixels, scores)
             # One camera costs less than six.
-            return self._exposure.ahead(pixels), [len(points)], points, pixels, scores
-        if not isinstance(points, Mapping) or pixels is not None or scores is not None:
+            exposure, counts = self._exposure.ahead(pixels), [len(points)]
+        elif not isinstance(points, Mapping) or pixels is not None or scores is not None:
             raise ValueError(
                 "a frame of a rig is {name: (points, pixels)}, also with scores behind them; its "
                 f"cameras are {', '.join(self.rig.cameras)}"
             )
-        return checked_of_rig(self.rig, points, stamps)
+        else:
+            exposure, counts, points, pixels, scores = checked_of_rig(self.rig, points, stamps)
+        usable = find_usable(exposure, points, pixels, counts, None)
+        seen = packed(exposure, points, usable)
+        return FrameSights(exposure, counts, points, pixels, scores, usable, seen)
 
     def _found(
         self, observed: Observed, prior: Prior | None, expected_share: float
@@ -329,7 +329,7 @@ class Localizer:
         if prior is not None and prior.motion is not None:
             tracked = self._track(observed, prior, expected_share)
             if tracked and not _is_bent(tracked):
-                return replace(tracked, tracked=True)
+                return altered(tracked, tracked=True)
         found = self._searched(observed)
         if not tracked or prior is None:
             return found
@@ -338,7 +338,7 @@ class Localizer:
                 return found
             if not knows_speed(observed.terms, prior):
                 return _or_else(found, tracked)
-        return replace(tracked, tracked=True)
+        return altered(tracked, tracked=True)
 
     def _searched(self, observed: Observed) -> Estimate | Failure:
         # 3. A global-shutter start, then hypotheses of the solver (LO-RANSAC).
@@ -372,34 +372,14 @@ class Localizer:
         posterior = self._settle(observed, best, terms)
         result = self._accept(observed, best, posterior, prior)
         if result and np.count_nonzero(result.inliers) < (
-            _STILL_TRACKED * expected_share * observed.observations.count
+            _STILL_TRACKED * expected_share * len(observed.observations)
         ):
             return Failure(
                 Reason.TOO_FEW_INLIERS,
                 f"{np.count_nonzero(result.inliers)} inliers near the prior motion, "
-                f"{expected_share:.0%} of {observed.observations.count} were expected",
+                f"{expected_share:.0%} of {len(observed.observations)} were expected",
             )
         return result
-
-    def reprojection_errors(
-        self,
-        found: Estimate,
-        points: ArrayLike | Mapping[str, Sequence[ArrayLike]],
-        pixels: ArrayLike | None = None,
-        stamps: Mapping[str, float] | None = None,
-    ) -> Array:
-        """Return residuals (n,) px by another motion than the frame's own; NaN of unusable points.
-
-        Arguments as of :meth:`localize`.
-        """
-        exposure, counts, landmarks, seen, _ = self._sights(points, pixels, None, stamps)
-        usable = find_usable(exposure, landmarks, seen, counts, None)
-        own, state = packed(exposure, landmarks, usable), state_in(found, usable.centre)
-        lines = linearized(own.packed, len(own), state, shake_at(own.tau, found.shake))
-        errors = np.full(len(landmarks), np.nan)
-        errors[usable.indices] = np.linalg.norm(lines.errors, axis=1)
-        errors[usable.indices[np.isinf(own.squared_errors(state))]] = np.inf
-        return errors[usable.originals]
 
     def known_of(
         self, prior: Prior | None, span: float, rotation: RotationPrior | None = None
@@ -429,7 +409,7 @@ class Localizer:
         )  # fmt: skip
         observations = observed.observations
         if not self._full:
-            seen = observations.packed, observations.count
+            seen = observations.packed, len(observations)
             return Posterior(*best_motion(*seen, best.state, terms, gate))._replace(gate=gate)
         threshold, most, rolling = gate, _WIDEST * gate, self._solver.rolling_shutter
         searched = terms is observed.terms and rolling
@@ -497,7 +477,7 @@ class Localizer:
         covariance = np.array(prior.covariance, float)
         covariance[POSE] = covariance[:, POSE] = 0.0
         np.fill_diagonal(covariance[POSE, POSE], np.inf)
-        of_velocities = unchecked(prior, covariance=covariance)
+        of_velocities = altered(prior, covariance=covariance)
         turned = observed.rotation is not None
         return with_motion(observed.terms, of_velocities, observed.centre, turned)
 
@@ -547,4 +527,4 @@ class Localizer:
                 effect = effect_of(parts.part)
         effect = widened(effect, posterior)
         estimate = estimate_of(observed, posterior, best.samples, effect, tracked)
-        return replace(estimate, left_out=odd.notice, moved_covariance=other)
+        return altered(estimate, left_out=odd.notice, moved_covariance=other)

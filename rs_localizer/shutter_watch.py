@@ -30,7 +30,6 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, Array1, Array2
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.rig import Rig
 from rs_localizer.core.scanning import ACROSS, REVERSED, ScanDirection
 from rs_localizer.core.state import (
     ANGULAR_ACCELERATION,
@@ -40,8 +39,8 @@ from rs_localizer.core.state import (
     TURN,
     VELOCITIES,
 )
-from rs_localizer.core.types import Estimate, Failure, roughness
-from rs_localizer.estimation.points import find_usable, packed
+from rs_localizer.core.types import Estimate, Failure, altered, roughness
+from rs_localizer.estimation.points import FrameSights
 from rs_localizer.estimation.prior import state_in
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.stabilizer import RowRotation, RowRotations
@@ -166,7 +165,7 @@ class _Way(NamedTuple):
         others = before, after
         times = 1e-9 * np.array([look.time_ns - now.time_ns for look in others])
         ways = np.array([step_from(now.found, look.found)[POSE] for look in others])
-        noise = np.sum([look.found.joint_covariance[POSE, POSE] for look in others], axis=0)
+        noise = before.found.joint_covariance[POSE, POSE] + after.found.joint_covariance[POSE, POSE]
         way = ways[1] - ways[0]
         try:
             moves = way @ np.linalg.solve(noise, way) > _LEAST_MOTION
@@ -199,7 +198,6 @@ class ShutterWatch:
         self._gate, self._camera, self._usual = _GATE * threshold, camera, 0.0
         if camera is not None:
             self._usual = camera.readout_time  # s
-            self._exposure = Rig.of(camera).exposure().ahead()
             self._direction = ScanDirection(camera.scan_direction)
             self._sideways = replace(camera, scan_direction=ACROSS[self._direction])
         self.reset()
@@ -246,14 +244,14 @@ class ShutterWatch:
         """Return the last frame with a covariance that allows for what the watch has found."""
         if self._camera is None:
             return found
-        own = np.r_[found.angular_velocity, found.linear_velocity]
+        own = np.concatenate([found.angular_velocity, found.linear_velocity])
         sway = _SWAY * self._turned(float(np.linalg.norm(found.angular_velocity)))
         if self.error or sway:
             calibration = found.calibration_covariance.copy()
             calibration[TURN, TURN] += sway**2 * np.eye(3)
             longer = self.error / self._usual * own
             calibration[VELOCITIES, VELOCITIES] += np.outer(longer, longer)
-            found = replace(found, calibration_covariance=calibration)
+            found = altered(found, calibration_covariance=calibration)
         if not (self._reversed or self._across):
             return found
         steps, velocities = [np.r_[np.zeros(6), -2.0 * own]], np.r_[np.zeros(6), own]
@@ -266,9 +264,8 @@ class ShutterWatch:
         return replace(found, joint_covariance=joint)
 
     def add(
-        self, time_ns: int, found: Estimate | Failure, points: Array, pixels: Array,
-        *, jumped: bool = False,
-    ) -> None:  # fmt: skip
+        self, time_ns: int, found: Estimate | Failure, sights: FrameSights, *, jumped: bool = False
+    ) -> None:
         """Take a frame whose middle row was exposed at ``time_ns``, as it was localized.
 
         ``jumped``: no camera goes there from the last frame. No motion within an image tells of
@@ -286,9 +283,7 @@ class ShutterWatch:
         is_close = bool(self._looks) and time_ns - self._looks[-1].time_ns < 1e9 * _CLOSEST
         if is_close and not self._across:
             return
-        some = slice(None, None, 1 + len(points) // _MOST_POINTS)
-        points, pixels = map(np.ascontiguousarray, (points[some], pixels[some]))
-        self._seen = self._look(time_ns, found, points, pixels)
+        self._seen = self._look(time_ns, found, sights)
         if is_close:
             return
         self._looks.append(self._seen)
@@ -314,22 +309,24 @@ class ShutterWatch:
             self._measure(now, way, widest)
             self._judge(way.seconds)
 
-    def _look(self, time_ns: int, found: Estimate, points: Array, pixels: Array) -> _Look:
-        usable = find_usable(self._exposure, points, pixels, [len(pixels)], None)
-        seen, own = packed(self._exposure, points, usable), usable.indices
-        state = state_in(found, usable.centre)
+    def _look(self, time_ns: int, found: Estimate, sights: FrameSights) -> _Look:
+        seen, own = sights.observations, sights.usable.indices
+        if len(own) > _MOST_POINTS:
+            some = np.arange(0, len(own), 1 + len(own) // _MOST_POINTS)
+            seen, own = seen.only(some), own[some]
+        state = state_in(found, sights.usable.centre)
         state[STATE_ANGULAR_ACCELERATION.start :] = 0.0
         lines = linearized(seen.packed, len(seen), state, np.zeros((len(seen), 6)))
         near = np.linalg.norm(lines.errors, axis=1) < self._gate  # NaN is not
-        away = np.linalg.norm(points[own][near] - found.position, axis=1)
+        away = np.linalg.norm(sights.points[own[near]] - found.position, axis=1)
         # Of distances of two sizes a median is now one, now the other: what wanders would jump.
         units = np.repeat([1.0, 1.0 / float(np.mean(1.0 / away)) if near.any() else 1.0], 3)
         by_pose = lines.by_motion[near, :, POSE] * units
         over_rows = lines.by_motion[near, :, VELOCITIES] * units
-        over_columns = self._sideways.row_time(pixels[own][near])[:, None, None] * by_pose
+        over_columns = self._sideways.row_time(sights.pixels[own[near]])[:, None, None] * by_pose
         rows = np.concatenate([by_pose, over_rows, over_columns], axis=2).reshape(-1, 18)
         bent = lines.by_motion[near, :, ANGULAR_ACCELERATION].reshape(-1, 3)
-        speed = np.r_[found.angular_velocity, found.linear_velocity] / units
+        speed = np.concatenate([found.angular_velocity, found.linear_velocity]) / units
         off = rows[:, 6:12] @ speed - lines.errors[near].ravel()
         return _Look(time_ns, found, units, rows, bent, off)
 
@@ -360,10 +357,10 @@ class ShutterWatch:
         self, now: _Look, way: _Way, speed: Array, weights: Array, wandering: Array, jump: Array
     ) -> None:
         """Compare the rotation over the rows of a frame with that between frames."""
-        design = np.c_[now.rows[:, :9], now.bent]
+        design = np.concatenate([now.rows[:, :9], now.bent], axis=1)
         weighed = (design * weights[:, None]).T
         covariance = np.linalg.inv(weighed @ design)
-        moved = self._usual * np.c_[now.rows[:, 6:12] @ speed, now.rows[:, 12:] @ speed]
+        moved = self._usual * (now.rows[:, 6:].reshape(-1, 2, 6) @ speed)
         turned = (covariance @ (weighed @ (now.off - moved[:, 0])))[6:]
         turned[3:] -= self._usual**2 * way.change[:3]
         covariance, by_shutter = covariance[6:, 6:], (covariance @ (weighed @ moved))[6:]
@@ -372,7 +369,8 @@ class ShutterWatch:
         shorter = (self._usual * self._shorter) ** 2 * float(speed[:3] @ speed[:3])
         covariance[:3, :3] += wandering + shorter * np.eye(3)
         # All of the jump may be within the rows.
-        covariance += np.kron(np.diag([1.0, 12.0]), self._usual**2 * np.outer(jump, jump))
+        covariance[:3, :3] += self._usual**2 * np.outer(jump, jump)
+        covariance[3:, 3:] += 12.0 * self._usual**2 * np.outer(jump, jump)
         one = RowRotation(turned, covariance, by_shutter)
         self._rotations.add(one, 2.0 * self._usual / way.seconds)
 
@@ -413,8 +411,9 @@ class ShutterWatch:
 
     def _far(self, over_rows: float, over_columns: float) -> float:
         """Return half the squared distance of a shutter from what is estimated."""
-        off = self._mean[_TIMES] - (over_rows, over_columns)
-        return 0.5 * float(off @ np.linalg.solve(self._covariance[_TIMES, _TIMES], off))
+        x, y = (self._mean[_TIMES] - (over_rows, over_columns)).tolist()
+        (a, b), (_, c) = self._covariance[_TIMES, _TIMES].tolist()
+        return 0.5 * float(c * x * x - 2.0 * b * x * y + a * y * y) / float(a * c - b * b)
 
     def _judge(self, seconds: float) -> None:
         """Judge what is contradicted; neighbours are so far apart."""

@@ -38,12 +38,13 @@ from rs_localizer.core.state import (
     TURN,
     VELOCITIES,
 )
-from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.core.types import Estimate, Failure, altered
 from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.estimation.frames_together import CamerasTogether
 from rs_localizer.estimation.known_rotation import Aid, Foretold, LastFrame
 from rs_localizer.estimation.moved_part import MovedPart, MovedParts
-from rs_localizer.estimation.prior import Prior, beside, predicted, unchecked
+from rs_localizer.estimation.points import FrameSights
+from rs_localizer.estimation.prior import Prior, beside, predicted
 from rs_localizer.estimation.window import (
     FADING,
     LENGTH,
@@ -54,8 +55,8 @@ from rs_localizer.estimation.window import (
     gaussian_of,
     predicted_estimate,
     step_from,
+    swing_of,
     told_of,
-    unshaken,
 )
 from rs_localizer.integrity import Integrity
 from rs_localizer.lens_watch import LensWatch
@@ -122,9 +123,7 @@ class _Seen:
 
     time_ns: int
     found: Estimate | Failure  # by its own fit; later by the window
-    points: Any
-    pixels: Any
-    stamps: Mapping[str, float] | None = None
+    sights: FrameSights | None = None  # of a frame that may be published again
     gate: float = 0.0  # px, of inliers; by its own fit, also if it is published again
 
 
@@ -285,8 +284,8 @@ class Tracker:
             return given[1] if given is not None and given[0] == time_ns else None
         own = track.estimate.span
         share = self._readout_time_deviation(context) / own
-        window = replace(track.window, readout_share=share)
-        motion, covariance = window.foreseen(time_ns).per_readout(own if span is None else span)
+        foreseen = track.window.foreseen(time_ns, share)
+        motion, covariance = foreseen.per_readout(own if span is None else span)
         return predicted(motion, covariance + track.swing)
 
     def at(self, time_ns: int, readings: Any = None) -> Estimate | None:
@@ -421,26 +420,24 @@ class Tracker:
             self.aid.reset()
         again = self._again(time_ns, points, pixels, readings)
         if again is not None:
-            self._keep(_Seen(time_ns, again, points, pixels, stamps))
+            self._keep(_Seen(time_ns, again))
             return self.delayed
+        sights = self.localizer.sights(points, pixels, scores, stamps)
         share = 0.0 if self._track is None else self._track.share
         modes = self.lens.errors_of(context.error_modes)
 
         def find(prior: Prior | None, rotation: RotationPrior | None) -> Estimate | Failure:
-            return self._allowing.find(
-                points, pixels, scores, prior, share, rotation, stamps, modes, self._parts
-            )
+            return self._allowing.find(sights, prior, share, rotation, modes, self._parts)
 
         foreseen = None
         if self.aid is not None:
             foreseen = self.aid.foresee(readings, time_ns, self._before(time_ns))
         result, prior, told = self._fitted(time_ns, foreseen, span, context, find)
         if pixels is not None:  # of a camera alone
-            seen = np.asarray(points, float), np.asarray(pixels, float)
-            self._watch(time_ns, result, prior, *seen, scores)
-        elif result and self.remembers_motion and isinstance(points, Mapping):
-            terms = self.localizer.known_of(None, result.span)
-            self.cameras.add(result, terms, points, stamps)
+            seen = sights.points, sights.pixels
+            self._watch(time_ns, result, prior, sights)
+        elif result and self.remembers_motion:
+            self.cameras.add(result, self.localizer.known_of(None, result.span), sights)
             result = self.cameras.widened(result)
         if result:
             if pixels is not None:
@@ -448,33 +445,34 @@ class Tracker:
                 result = self.lens.widened(result, *seen)
             result = self.shutter.widened(result)
             if self.remembers_motion:
-                result = self._covering(replace(result, time_ns=time_ns))
+                result = self._covering(altered(result, time_ns=time_ns))
                 self._remember(time_ns, told, result, context)
-        self._keep(_Seen(time_ns, result, points, pixels, stamps))
+        self._keep(_Seen(time_ns, result, sights))
         self._images.add(time_ns, points, pixels)
         self._publish()
         return self.delayed
 
     def _watch(
-        self, time_ns: int, result: Estimate | Failure, prior: Prior | None, points: Array,
-        pixels: Array, scores: ArrayLike | None,
-    ) -> None:  # fmt: skip
+        self, time_ns: int, result: Estimate | Failure, prior: Prior | None, sights: FrameSights
+    ) -> None:
         """Compare a frame of a camera alone with the last ones."""
         jumped = self._has_jumped(time_ns, prior, result)
         if result:
-            self._compare_pace(time_ns, result, jumped, points, pixels, scores)
+            self._compare_pace(time_ns, result, jumped, sights)
         if self.pace.fault:  # neighbours are of two cameras, or in another unit
             self.lens.reset()
         else:
-            self.lens.add(time_ns, result, points, pixels, jumped=jumped)
+            self.lens.add(time_ns, result, sights.points, sights.pixels, jumped=jumped)
         self._allow(self.lens.calibration)
         if self.lens.matrix is None:
-            self.shutter.add(time_ns, result, points, pixels, jumped=jumped)
+            self.shutter.add(time_ns, result, sights, jumped=jumped)
         doubtful = self.shutter.error or not self.shutter.trusted
         if doubtful and self.remembers_motion:  # alone, frames may have any velocities
             self._parts.discard()
 
-    def _compare_pace(self, time_ns: int, result: Estimate, jumped: bool, *frame: Any) -> None:
+    def _compare_pace(
+        self, time_ns: int, result: Estimate, jumped: bool, sights: FrameSights
+    ) -> None:
         away, before = None, self._seen[-2].found if len(self._seen) > 1 else None
         if jumped and self._track is not None and before:
             step, back = (step_from(one, result)[POSE] for one in (self._track.estimate, before))
@@ -486,9 +484,9 @@ class Tracker:
                 return result
             if not (self.lens.is_beyond(result) or self.pace.is_odd):
                 return Failure(Reason.AWAITS_FRAMES, "")
-            return self.localizer.localize(*frame)
+            return self.localizer.accepted(self.localizer.find(sights))
 
-        self.pace.add(time_ns, result, frame[0], alone)
+        self.pace.add(time_ns, result, sights.points, alone)
 
     def _allow(self, calibration: CalibrationErrors) -> None:
         """Let the next frames have these deviations."""
@@ -557,7 +555,6 @@ class Tracker:
         if isinstance(seen.found, Estimate):
             fitted = seen.found.residuals[seen.found.inliers].max(initial=0.0)
             seen.gate = max(self.localizer.config.inlier_threshold, fitted)
-        seen.points, seen.pixels = _own(seen.points), _own(seen.pixels)
         self._seen.append(seen)
 
     def _again(
@@ -631,15 +628,13 @@ class Tracker:
             return
         known = {time_ns: k for k, time_ns in enumerate(reversed(window.times))}
         for seen in list(self._seen)[-1 - self.output_lag :]:
-            if not seen.found or seen.found.aided or seen.time_ns not in known:
+            if not (seen.found and seen.sights) or seen.found.aided or seen.time_ns not in known:
                 continue
             found = estimate_at(seen.found, window.before(known[seen.time_ns]))
-            residuals = self.localizer.reprojection_errors(
-                found, seen.points, seen.pixels, seen.stamps
-            )
+            residuals = seen.sights.residuals(found)
             if isinstance(found.residuals, ByCamera):
                 residuals = found.residuals.like(residuals)
-            seen.found = replace(found, residuals=residuals, inliers=residuals <= seen.gate)
+            seen.found = altered(found, residuals=residuals, inliers=residuals <= seen.gate)
 
     def _covering(self, result: Estimate) -> Estimate:
         """Return the estimate with velocities as uncertain as frames show them, if rows may not.
@@ -672,7 +667,7 @@ class Tracker:
         before, self._judged_ns = self._judged_ns, time_ns  # of images that have no track, too
         gone = time_ns - before if before is not None else 0
         later = 1e-9 * gone if gone > 0 else math.inf
-        return replace(result, integrity=self._integrity.add(numbers, later))
+        return altered(result, integrity=self._integrity.add(numbers, later))
 
     def _prior(
         self, time_ns: int, rotation: RotationPrior | None, span: float | None,
@@ -687,7 +682,7 @@ class Tracker:
             prior = replace(prior, covariance=_UNKNOWN, of_rest=rest)
         if rotation is None:
             if prior is not None and self._track is not None:
-                prior = unchecked(prior, of_vibration=self._track.vibrations)
+                prior = altered(prior, of_vibration=self._track.vibrations)
             return prior
         return None if prior is None else beside(prior, rotation)
 
@@ -695,14 +690,14 @@ class Tracker:
         self, time_ns: int, told: MotionSample | None, result: Estimate, context: FrameContext
     ) -> None:
         """Keep what the next frames are to know of this one."""
-        track, share, vibrations = self._track, float(np.mean(result.inliers)), result.vibrations
+        track, share, vibrations = self._track, float(result.inliers.mean()), result.vibrations
         if track is not None and result.tracked:
             share = (1.0 - _NEWEST) * track.share + _NEWEST * share
         if track is not None and track.vibrations.size:
             # Beside an aid they are of another kind: of what it leaves.
             is_new = vibrations.size and not result.aided
             vibrations = track.vibrations + (vibrations if is_new else 0.0)
-        window, swing = self._window(time_ns, told, result, context), unshaken(result)[2]
+        window, swing = self._window(time_ns, told, result, context), swing_of(result)
         self._track = _Track(result, time_ns, share, window, swing, _REMEMBERED * vibrations)
 
     def _window(
@@ -748,13 +743,6 @@ class Tracker:
         added[:, VELOCITIES] *= math.copysign(1.0, dt)
         fading = math.copysign(FADING, dt) / readout_time
         return LastFrame(track.time_ns, motion, covariance, added, fading)
-
-
-def _own(arrays: Any) -> Any:
-    """Return copies of the arrays of a frame: the caller may fill his with the next one."""
-    if isinstance(arrays, Mapping):
-        return {name: [None if x is None else np.array(x) for x in arrays[name]] for name in arrays}
-    return None if arrays is None else np.array(arrays)
 
 
 def _check_motion(localizer: Localizer) -> None:

@@ -194,7 +194,6 @@ BY_KEYWORDS = {
     "cli/options.py: option",
     "solvers/minimal.py: solve_minimal",
     "localizer.py: localize",
-    "localizer.py: find",
     "tracking.py: localize",
 }
 

@@ -43,7 +43,7 @@ def bearings(camera: Camera, pixels: Array) -> tuple[Array, Array]:
 def projected(camera: Camera, rays: Array) -> tuple[Array, Array]:
     """Return raw pixels (n,2) and derivatives at rays (n,2), as :meth:`Camera.distort` does."""
     lens = pinhole(camera)
-    return camera.distort(rays) if lens is None else _projected(rays, *lens)
+    return camera.distort(rays) if lens is None else projected_by(rays, *lens)
 
 
 @lru_cache(64)  # of the cameras of a rig, and lenses that are tried
@@ -155,7 +155,7 @@ def _bearings(
 
 
 @entry
-def _projected(rays: Array2, focal: Array1, centre: Array1, lens: Array1) -> tuple[Array, Array]:
+def projected_by(rays: Array2, focal: Array1, centre: Array1, lens: Array1) -> tuple[Array, Array]:
     """Return the pixels (n,2), and their derivatives (n,2,2) by the rays."""
     count = len(rays)
     pixels, by_ray = np.empty((count, 2)), np.empty((count, 2, 2))
@@ -173,14 +173,3 @@ def _projected(rays: Array2, focal: Array1, centre: Array1, lens: Array1) -> tup
                     slope = image[(2 + 2 * axis + by) * LANES + lane]
                     by_ray[first + lane, axis, by] = focal[axis] * slope
     return pixels, by_ray
-
-
-def radial_slopes(rays: Array, focal: Array, lens: Array) -> tuple[Array, Array]:
-    """Return pixels (n,2), from the image's centre, of rays (n,2); derivatives (n,2) by k1.
-
-    Through a lens of :func:`pinhole`.
-    """
-    square = np.sum(rays**2, axis=1)
-    below = 1.0 + square * (lens[5] + square * (lens[6] + square * lens[7]))
-    slopes: Array = focal * rays * (square / below)[:, None]
-    return _projected(rays, focal, np.zeros(2), lens)[0], slopes

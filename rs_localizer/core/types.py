@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from numbers import Real
-from typing import TYPE_CHECKING, Any, Literal, NoReturn, Self
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, Self, TypeVar
 
 import numpy as np
 
@@ -31,6 +31,20 @@ _PARABOLAS = np.vander(_ROWS, 3) @ np.linalg.pinv(np.vander(_ROWS, 3))
 _LAST_ROW = 0.55
 # s: no motion goes on as it is for so long; more are milliseconds or nanoseconds.
 _LONGEST_AWAY = 60.0
+
+
+_Frozen = TypeVar("_Frozen")
+
+
+def altered(one: _Frozen, **parts: Any) -> _Frozen:
+    """Return a frozen dataclass with other parts, which are not checked.
+
+    Takes a third of the time of ``dataclasses.replace``.
+    """
+    other, names = object.__new__(type(one)), vars(type(one))["__dataclass_fields__"]
+    for name, value in ({name: getattr(one, name) for name in names} | parts).items():
+        object.__setattr__(other, name, value)
+    return other
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -89,7 +103,7 @@ class Estimate(Motion):
         frame = self.undetected_covariance + self.moved_covariance
         return own + self.calibration_covariance + frame
 
-    def with_joint_covariance(self, joint_covariance: Array, **fields: Any) -> Self:
+    def with_joint_covariance(self, joint_covariance: Array, **parts: Any) -> Self:
         """Return the estimate with a covariance that other frames have determined.
 
         Arcs may narrow the old covariance by its correlations, which the new one may lack. So only
@@ -99,8 +113,8 @@ class Estimate(Motion):
         known = (variances > 0.0) & (variances < np.inf)
         scale = np.sqrt(np.where(known, variances, 1.0))
         undetected = _widening(np.ascontiguousarray(self.undetected_covariance), scale)
-        return replace(
-            self, joint_covariance=joint_covariance, undetected_covariance=undetected, **fields
+        return altered(
+            self, joint_covariance=joint_covariance, undetected_covariance=undetected, **parts
         )
 
     @property

@@ -22,7 +22,7 @@ import numpy as np
 
 from rs_localizer.config import CalibrationErrors
 from rs_localizer.core.arrays import Array, Array1, Array2
-from rs_localizer.core.bearings import pinhole, radial_slopes
+from rs_localizer.core.bearings import pinhole, projected_by
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import by_lens, coefficients_of, corner_of
 from rs_localizer.core.shake import shake_at
@@ -123,7 +123,7 @@ def calibration_effect(
         chosen = chosen[np.linspace(0, found - 1, _MANY).astype(np.int64)]
     some = observations.only(chosen)
     state, tau = posterior.state, some.tau
-    lines = linearized(some.packed, some.count, state, shake_at(tau, posterior.shake))
+    lines = linearized(some.packed, len(some), state, shake_at(tau, posterior.shake))
     by_motion, image = lines.by_motion, lines.image
     rotation, rays = observed.rotation, image
     if rotation is not None:  # which was taken out
@@ -229,21 +229,36 @@ def _columns(camera: Camera, towards: Array, deviation: CalibrationErrors) -> Ar
     """Return shifts (n,2,5) px of rays or bearings by a standard deviation of each error."""
     corner = corner_of(camera)
     corner_pixels = corner * camera.focal_length / camera.binning[0]
-    columns = np.zeros((len(towards), 2, _ERRORS))
-    columns[:, 0, 0] = columns[:, 1, 1] = deviation.principal_point
     lens = pinhole(camera)
     if lens is not None:  # the same, for less
-        pixels, slopes = radial_slopes(towards, lens[0], lens[2])
-        columns[:, :, 2] = deviation.focal_length * pixels
-        columns[:, :, 3] = deviation.distortion / (corner_pixels * corner**2) * slopes
-        columns[:, :, 4] = deviation.aspect_ratio * pixels * _ASPECT
+        by_k1 = deviation.distortion / (corner_pixels * corner**2)
+        sizes = deviation.principal_point, deviation.focal_length, by_k1, deviation.aspect_ratio
+        columns: Array = _by_pinhole(towards, lens[0], lens[2], np.array(sizes))
         return columns
+    columns = np.zeros((len(towards), 2, _ERRORS))
+    columns[:, 0, 0] = columns[:, 1, 1] = deviation.principal_point
     by_all = by_lens(camera, towards)
     focal = coefficients_of(camera) - 4
     columns[:, :, 2] = deviation.focal_length * by_all[:, :, focal : focal + 2].sum(axis=2)
     columns[:, :, 3] = deviation.distortion / corner_pixels * by_all[:, :, 0]
     by_each = np.diagonal(by_all[:, :, focal : focal + 2], axis1=1, axis2=2)
     columns[:, :, 4] = deviation.aspect_ratio * by_each * _ASPECT
+    return columns
+
+
+@entry
+def _by_pinhole(rays: Array2, focal: Array1, lens: Array1, sizes: Array1) -> Array:
+    """Return shifts as :func:`_columns` through a lens of :func:`pinhole`, by errors (4,)."""
+    columns = np.zeros((len(rays), 2, _ERRORS))
+    pixels, _ = projected_by(rays, focal, np.zeros(2), lens)
+    for i in range(len(rays)):
+        square = np.sum(rays[i] ** 2)
+        slope = square / (1.0 + square * (lens[5] + square * (lens[6] + square * lens[7])))
+        for axis in range(2):
+            columns[i, axis, axis] = sizes[0]
+            columns[i, axis, 2] = sizes[1] * pixels[i, axis]
+            columns[i, axis, 3] = sizes[2] * focal[axis] * rays[i, axis] * slope
+            columns[i, axis, 4] = sizes[3] * pixels[i, axis] * _ASPECT[axis]
     return columns
 
 

@@ -17,14 +17,13 @@ the angle: what one three hardly tells, some from different angles do.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
 from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core import so3
@@ -45,7 +44,7 @@ from rs_localizer.core.state import (
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.calibration import LandmarkErrors
 from rs_localizer.estimation.linear_fit import known_at
-from rs_localizer.estimation.points import checked_of_rig, find_usable, pack, packed
+from rs_localizer.estimation.points import FrameSights, find_usable, pack, packed
 from rs_localizer.estimation.prior import PriorTerms, state_in
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.native import entry
@@ -303,7 +302,7 @@ class _Three:
 
     def lines(self, k: int, numbers: Array, principal: Array) -> tuple[Array, Array]:
         """Return errors (n,2) of a frame, and their derivatives (n,2,36) by own and shared ones."""
-        poses = np.array([np.vstack(pose) for pose in self.poses])
+        poses = np.array([[*turn, place] for turn, place in self.poses])
         lens = np.array([*principal, self._corner, self._focal_length])
         errors, columns = _lines_of(k, self.frames[k], poses, self.own, numbers, lens)
         return errors, columns
@@ -665,17 +664,13 @@ class CamerasTogether:
         self.fault = ""
         """The camera that frames show to be wrong, and what it has, in one sentence."""
 
-    def add(
-        self, found: Estimate, terms: PriorTerms, parts: Mapping[str, Sequence[ArrayLike]],
-        stamps: Mapping[str, float] | None,
-    ) -> None:  # fmt: skip
+    def add(self, found: Estimate, terms: PriorTerms, sights: FrameSights) -> None:
         """Take a frame of a rig with a pose, and what is known of its motion beside it."""
-        exposure, counts, points, pixels, _ = checked_of_rig(self.rig, parts, stamps)
+        exposure, usable = sights.exposure, sights.usable
         if exposure.lenses is None:
             return
-        usable = find_usable(exposure, points, pixels, counts, None)
-        some = usable.indices[np.asarray(found.inliers)[usable.indices]]
-        seen = packed(exposure, points, usable._replace(indices=some))
+        fitting = np.flatnonzero(np.asarray(found.inliers)[usable.indices])
+        seen = sights.observations.only(fitting)
         state = state_in(found, usable.centre)
         lines = linearized(seen.packed, len(seen), state, shake_at(seen.tau, found.shake))
         tau, by_pose = seen.tau[:, None], lines.by_motion[:, :, POSE]

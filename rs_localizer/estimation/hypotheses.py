@@ -176,11 +176,11 @@ def frame_posterior(
         threshold: px, of inliers.
         assumed: of the camera.
     """
-    if observations.count > MOST_POINTS:
-        some = np.linspace(0, observations.count - 1, MOST_POINTS).astype(np.int64)
+    if len(observations) > MOST_POINTS:
+        some = np.linspace(0, len(observations) - 1, MOST_POINTS).astype(np.int64)
         part = frame_posterior(observations.only(some), start, terms, threshold, assumed)
         lines = linearized(
-            observations.packed, observations.count, part.state,
+            observations.packed, len(observations), part.state,
             shake_at(observations.tau, part.shake),
         )  # fmt: skip
         errors = np.sum(lines.errors**2, axis=1)
@@ -190,7 +190,7 @@ def frame_posterior(
             depth = max(observations.median_depth(part.state, inliers), NEAREST)
             bend = bend_of(observations.points, inliers, depth / assumed.focal_length)
         return part._replace(squared_errors=errors, inliers=inliers, bend=bend)
-    best = Posterior(*best_motion(observations.packed, observations.count, start, terms, threshold))
+    best = Posterior(*best_motion(observations.packed, len(observations), start, terms, threshold))
     if not best.determined or np.count_nonzero(best.inliers) < _FEWEST:
         return best
     given = _given(observations, best, terms, threshold, assumed)
@@ -217,7 +217,7 @@ def _given(
     assumed: Assumed,
 ) -> _Given:  # fmt: skip
     """Compute everything that does not depend on the hypothesis."""
-    data, points, count = observations.packed, observations.points, observations.count
+    data, points, count = observations.packed, observations.points, len(observations)
     found = int(np.count_nonzero(best.inliers))
     depth = max(observations.median_depth(best.state, best.inliers), NEAREST)
     lines = linearized(data, count, best.state, np.zeros((count, 6)))
@@ -277,7 +277,7 @@ def _steady(given: _Given, speeds: Speeds, planar: bool) -> _Camera | None:
 
 def _of_outliers(given: _Given, inliers: BoolArray) -> float:
     """Return the log evidence of the other points, anywhere in an image of squared focal length."""
-    outside = given.observations.count - np.count_nonzero(inliers)
+    outside = len(given.observations) - np.count_nonzero(inliers)
     return 2.0 * outside * math.log(given.assumed.focal_length)
 
 
@@ -331,7 +331,7 @@ def _at(given: _Given, state: Array, turn: Array, gate: float) -> _Turning:
     """Return the points at a motion with in-frame rotation; inliers lie within a gate (px)."""
     observations = given.observations
     shake = shake_at(observations.tau, COMBINATIONS @ turn.reshape(RESOLVED, 3))
-    lines = linearized(observations.packed, observations.count, state, shake)
+    lines = linearized(observations.packed, len(observations), state, shake)
     squares = np.square(lines.errors).sum(axis=1)
     squares[np.isinf(observations.squared_errors(state))] = np.inf
     return _Turning(state, turn, lines, squares, squares < gate * gate)

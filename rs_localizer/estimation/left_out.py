@@ -270,7 +270,7 @@ def _own_motion(
     if _surprise(left, size, SAMPLE, math.pi * gate**2 / area) < _LEAST_CHANCE:
         return None
     chosen = observations.only(np.flatnonzero(group))
-    best = best_motion(chosen.packed, chosen.count, own.state, observed.terms, threshold)
+    best = best_motion(chosen.packed, len(chosen), own.state, observed.terms, threshold)
     if not np.isfinite(best.covariance).all():  # a motion that they do not determine is none
         return None
     errors = observations.squared_errors(best.state)
@@ -287,7 +287,7 @@ def _of_another_lens(
     threshold: float,
 ) -> Failure | None:  # fmt: skip
     """Return the failure of a frame that another matrix explains better than two motions."""
-    area, count = _area(observed), observed.observations.count
+    area, count = _area(observed), len(observed.observations)
     resized = off_centre(observed.exposure.cameras[0])
     found = [
         (_evidence((each[0],), PARAMETERS + _LENS, count, area), *each)
@@ -336,12 +336,12 @@ def _evidence_without_a_marker(observed: Observed, posterior: Posterior, thresho
     observations, area = observed.observations, _area(observed)
     evidences, markers = [-math.inf], _markers(observed)
     for marker in range(markers):
-        others = np.arange(observations.count) // 4 != marker
+        others = np.arange(len(observations)) // 4 != marker
         part = observations.only(np.flatnonzero(others))
-        best = best_motion(part.packed, part.count, posterior.state, observed.terms, threshold)
+        best = best_motion(part.packed, len(part), posterior.state, observed.terms, threshold)
         if best.inliers.any():
             group = _Group(best.inliers, best.state, best.squared_errors)
-            evidences.append(_evidence((group,), PARAMETERS + POSE.stop, part.count, area))
+            evidences.append(_evidence((group,), PARAMETERS + POSE.stop, len(part), area))
     return max(evidences) - math.log(max(markers, 1))
 
 
@@ -354,7 +354,7 @@ def _another_lens(
     with the focal length, and both show before a wall, where neither does alone.
     """
     focal, last = observed.assumed.focal_length, WIDEST_GATE * threshold
-    camera, enough = observed.exposure.cameras[0], observed.observations.count - SAMPLE
+    camera, enough = observed.exposure.cameras[0], len(observed.observations) - SAMPLE
     middle = centre_of(camera) / focal if of_size else 0.5 * np.array(camera.size) / focal
     starts: list[tuple[int, float, Array, Array, float]] = []
     for length, scaled in product(_LENGTHS, (True,) if of_size else (False, True)):
@@ -409,7 +409,7 @@ def _step(observed: Observed, state: Array, whitened: Array, off: Array, gate: f
     ``whitened`` (3,3) its derivative.
     """
     seen, usable = observed.observations, observed.usable
-    lines = linearized(seen.packed, seen.count, state, np.zeros((seen.count, 6)))
+    lines = linearized(seen.packed, len(seen), state, np.zeros((len(seen), 6)))
     near, size = np.square(lines.errors).sum(axis=1) < gate**2, PARAMETERS + _LENS  # NaN is not
     if np.count_nonzero(near) < SAMPLE + _LENS:
         return np.full(size, np.nan)

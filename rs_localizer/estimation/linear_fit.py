@@ -132,7 +132,7 @@ _LEAST_FREEDOM = 0.1
 # Smooth errors with less than this part of the noise's variance in any column are one size.
 _UNSEEN = 0.05
 # Logarithm of the odds below which larger sizes are not looked at, and a size has no part.
-_HOPELESS, _NO_PART = 9.0, 1e-3
+_HOPELESS, _NO_PART = 7.0, 1e-3
 # One frame tells no more of a vibration than this logarithm of odds: none is as Gaussian as that.
 _MOST_TOLD = 5.0
 # Points whose columns are multiplied at a time.

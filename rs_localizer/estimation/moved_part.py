@@ -158,11 +158,13 @@ class MovedParts:
         """
         points, inliers = observed.points[observed.usable.indices], posterior.inliers
         self._look(observed, posterior, terms, points)
+        if not (group.any() or len(self._apart[0])):
+            return moment
         axes = np.kron(np.eye(4), rotation_of(posterior.state))  # camera_from_map
         if group.any():
             self._apart = points[group], axes.T @ moment @ axes
         there, apart = self._apart
-        return axes @ (_mostly_out(there, points, inliers) * apart) @ axes.T
+        return _mostly_out(there, points, inliers) * (axes @ apart @ axes.T)
 
     def _look(
         self, observed: Observed, posterior: Posterior, terms: PriorTerms, points: Array
@@ -214,22 +216,19 @@ def neighbours_alike(look: Look) -> bool:
     count = len(errors)
     if count <= 2 * _NEIGHBOURS:
         return False
-    off = errors - errors.mean(axis=0)
-    products = sum(likeness(places, each, _NEIGHBOURS) for each in off.T)
+    off, places = errors - errors.mean(axis=0), np.ascontiguousarray(places)
+    products = sum(likeness(places, each.copy(), _NEIGHBOURS) for each in off.T)
     index = count * products / max(float(np.sum(off**2)), TINY)
     return index + 1.0 / count > _ALIKE / math.sqrt(2.0 * count * _NEIGHBOURS / 1.5)
 
 
-def likeness(points: Array, numbers: Array, neighbours: int) -> float:
-    """Return the mean product of numbers (n,) of points (n,3) and of their neighbours."""
-    widest = int(np.ptp(points, axis=0).argmax())
-    order = points[:, widest].argsort()
-    found: float = _likeness(points[order], numbers[order], neighbours, widest)
-    return found
-
-
 @entry
-def _likeness(points: Array2, numbers: Array1, neighbours: int, sorted_by: int) -> float:
+def likeness(points: Array2, numbers: Array1, neighbours: int) -> float:
+    """Return the mean product of numbers (n,) of points (n,3) and of their neighbours."""
+    extents = [np.max(points[:, axis]) - np.min(points[:, axis]) for axis in range(3)]
+    sorted_by = np.argmax(np.array(extents))
+    order = points[:, sorted_by].copy().argsort()
+    points, numbers = points[order], numbers[order]
     count, total = len(points), 0.0
     far, near = np.empty(neighbours), np.empty(neighbours)
     for i in range(count):

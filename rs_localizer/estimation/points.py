@@ -8,6 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import accumulate
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -29,19 +30,22 @@ from rs_localizer.core.blocks import median
 from rs_localizer.core.camera import numbers
 from rs_localizer.core.rig import Exposure, Mounts, Rig
 from rs_localizer.core.rotation_prior import RotationPrior, compensated
+from rs_localizer.core.shake import shake_at
 from rs_localizer.core.simd.tracing import LANES
-from rs_localizer.estimation.prior import Assumed, PriorTerms
+from rs_localizer.estimation.prior import Assumed, PriorTerms, state_in
 from rs_localizer.estimation.projection import (
     AXES,
     CENTRE,
     GRADIENT,
     POINT_SIZE,
     WEIGHT,
+    linearized,
     squared_errors,
 )
 from rs_localizer.native import entry, kernel
 
 if TYPE_CHECKING:
+    from rs_localizer.core.types import Estimate
     from rs_localizer.estimation.calibration import LandmarkErrors
     from rs_localizer.estimation.moved_part import MovedParts
 
@@ -206,23 +210,18 @@ class Observations:
     def __len__(self) -> int:
         return len(self.points)
 
-    @property
-    def count(self) -> int:
-        """Number of the points."""
-        return len(self.points)
-
     def lens_of(self, lenses: IntArray | None) -> IntArray | None:
         """Return which camera of a rig sees each point (n,), by that of each side; None: one."""
         return None if lenses is None else lenses[self.camera]
 
     def squared_errors(self, state: Array) -> Array:
         """Return squared reprojection errors (n,) in raw pixels."""
-        errors: Array = squared_errors(self.packed, self.count, state)
+        errors: Array = squared_errors(self.packed, len(self), state)
         return errors
 
     def within(self, state: Array, distance: float) -> BoolArray:
         """Return a mask (n,) of points that are reprojected to within a distance (px)."""
-        near: BoolArray = squared_errors(self.packed, self.count, state) < distance**2
+        near: BoolArray = squared_errors(self.packed, len(self), state) < distance**2
         return near
 
     def median_depth(self, state: Array, chosen: BoolArray) -> float:
@@ -291,7 +290,8 @@ def find_usable(
     A known rotation is taken out of them.
     """
     parts = []
-    for place, own in enumerate(np.split(pixels, np.cumsum(counts)[:-1])):
+    for place, last in enumerate(accumulate(counts)):
+        own = pixels[last - counts[place] : last]
         tau, (rays, by_ray, side) = exposure.row_time(place, own), exposure.look(place, own)
         if rotation is not None:
             gradient = exposure.mounts.gradients[0]  # of a camera alone
@@ -348,6 +348,28 @@ def _select(
                 seen[other], originals[other] = False, one
             later += 1
     return np.flatnonzero(seen), originals, shown, centre, extent
+
+
+class FrameSights(NamedTuple):
+    """The points of a frame, checked, and packed for all who ask what a motion leaves of them."""
+
+    exposure: Exposure
+    counts: Sequence[int]  # of the points of each camera
+    points: Array  # (n,3)
+    pixels: Array  # (n,2)
+    scores: Array | None  # (n,)
+    usable: Usable
+    observations: Observations  # the usable ones, relative to their median
+
+    def residuals(self, found: Estimate) -> Array:
+        """Return residuals (n,) px by a motion; NaN of unusable points."""
+        usable, own = self.usable, self.observations
+        state = state_in(found, usable.centre)
+        lines = linearized(own.packed, len(own), state, shake_at(own.tau, found.shake))
+        errors = np.full(len(self.points), np.nan)
+        errors[usable.indices] = np.linalg.norm(lines.errors, axis=1)
+        errors[usable.indices[np.isinf(own.squared_errors(state))]] = np.inf
+        return errors[usable.originals]
 
 
 def packed(exposure: Exposure, points: Array, usable: Usable) -> Observations:

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,6 +35,7 @@ from rs_localizer.core.state import (
     STATE_ANGULAR,
     STATE_SIZE,
 )
+from rs_localizer.core.types import altered
 from rs_localizer.native import entry, inlined
 from rs_localizer.solvers.table import Solver
 
@@ -168,14 +169,6 @@ class Prior:
 _NOTHING = Prior()
 
 
-def unchecked(prior: Prior, **changed: Any) -> Prior:
-    """Return a prior with other parts; what was checked of it is not checked again."""
-    found = object.__new__(Prior)
-    for each in fields(Prior):
-        object.__setattr__(found, each.name, changed.get(each.name, getattr(prior, each.name)))
-    return found
-
-
 def predicted(motion: Motion, covariance: Array) -> Prior | None:
     """Return the prior that a track predicts; None if its covariance is left with rounding errors.
 
@@ -185,7 +178,7 @@ def predicted(motion: Motion, covariance: Array) -> Prior | None:
         check_covariance(covariance)
     except ValueError:
         return None
-    return unchecked(_NOTHING, motion=motion, covariance=covariance)
+    return altered(_NOTHING, motion=motion, covariance=covariance)
 
 
 def state_in(motion: Motion, centre: Array) -> Array:
@@ -529,7 +522,7 @@ def beside(prior: Prior, rotation: RotationPrior) -> Prior:
     covariance[turning] = covariance[:, turning] = 0.0
     covariance[np.ix_(turning, turning)] = rotation.error
     still = replace(prior.motion, angular_velocity=np.zeros(3), angular_acceleration=np.zeros(3))
-    return unchecked(prior, motion=still, covariance=covariance)
+    return altered(prior, motion=still, covariance=covariance)
 
 
 def turn_seen(terms: PriorTerms, rotation: RotationPrior) -> TurnSeen:

@@ -9,7 +9,7 @@ sure. It knows a solver only as a function that turns samples into models.
 from __future__ import annotations
 
 import math
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -97,7 +97,7 @@ def pools_of(
     for place in range(len(observations.mounts.axes)):
         here = observations.camera == place
         tau = observations.tau[here]
-        row_range = float(np.ptp(tau)) if len(tau) else 0.0
+        row_range = float(tau.max() - tau.min()) if len(tau) else 0.0
         for points, ranked in groups:
             own = points[here[points]]
             if len(own) >= size:
@@ -273,16 +273,15 @@ def search(
     observations, solver = observed.observations, hypotheses.solver
     mounts, data = observations.mounts, observations.packed
     score, final, noise = hypotheses.score_scale, hypotheses.final_scale, hypotheses.noise
-    best, inlier_ratios, drawn = start, None, np.zeros(len(pools), np.int64)
-    rotations, shares = mounts.axes @ rotation, np.cumsum([pool.share for pool in pools])
-    bar = observations.count * score**2
+    best, inlier_ratios, drawn = start, None, [0] * len(pools)
+    rotations, shares = mounts.axes @ rotation, [*accumulate(pool.share for pool in pools)]
+    bar = len(observations) * score**2
     left = hypotheses.most if pools else 0
     while left > 0:
         samples = np.empty((min(hypotheses.block, left), solver.sample_size), np.int64)
-        ends = (shares / shares[-1] * len(samples)).astype(np.int64).tolist()
+        ends = [int(share / shares[-1] * len(samples)) for share in shares]
         for k, (first, last) in enumerate(pairwise([0, *ends])):
-            own = samples[first:last]
-            draw(pools[k], int(drawn[k]), observations.tau, observed.random, own)
+            draw(pools[k], drawn[k], observations.tau, observed.random, samples[first:last])
             drawn[k] += last - first
         models = np.empty((solver.solutions, MODEL_SIZE, len(samples)))
         camera = observations.camera[samples[:, 0]]
@@ -298,14 +297,15 @@ def search(
             best, inlier_ratios = found, None
         if inlier_ratios is None and best.found:
             near = observations.within(best.state, final)
-            inlier_ratios = np.array([np.mean(near[pool.points]) for pool in pools])
-        bar = min(bar, costs[0])
-        left = hypotheses.most - int(drawn.sum())
+            inlier_ratios = [near[each.points].sum() / len(each.points) for each in pools]
+        bar = min(bar, float(costs[0]))
+        left = hypotheses.most - sum(drawn)
         if inlier_ratios is not None:  # the chance that no sample held inliers alone
-            missed = np.prod((1.0 - inlier_ratios**solver.sample_size) ** drawn)
+            each = zip(inlier_ratios, drawn, strict=True)
+            missed = math.prod((1.0 - ratio**solver.sample_size) ** count for ratio, count in each)
             if missed < 1.0 - hypotheses.confidence:
                 break
-    return best._replace(samples=int(drawn.sum()))
+    return best._replace(samples=sum(drawn))
 
 
 # A global-shutter pose under motion misses the points of the first and last rows by a good part
@@ -371,7 +371,7 @@ class MotionSearch:
     def _global_shutter(self, observed: Observed, most: int) -> Candidate:
         """Find a pose that fits all rows roughly, with a wide threshold."""
         observations = observed.observations
-        every, size = np.ones(observations.count, np.bool_), self._start.sample_size
+        every, size = np.ones(len(observations), np.bool_), self._start.sample_size
         pools = pools_of(observations, size, every, observed.ranking, False)
         starts = self._starts._replace(most=most)
         return search(observed, starts, held_terms(), pools, np.eye(3), NOTHING)

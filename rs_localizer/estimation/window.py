@@ -31,6 +31,7 @@ sizes, and poses between images by what that makes.
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -58,7 +59,7 @@ from rs_localizer.core.state import (
     rotation_of,
     step_between,
 )
-from rs_localizer.core.types import Estimate
+from rs_localizer.core.types import Estimate, altered
 from rs_localizer.estimation.gaussian import Gaussians, mixture
 from rs_localizer.estimation.hypotheses import TEMPER
 from rs_localizer.estimation.prior import PriorTerms, add_prior, state_in
@@ -263,16 +264,18 @@ class MotionWindow:
         whole.state[STATE_TRANSLATION] -= rotation_of(whole.state) @ centre
         return Gaussian(self.times[row], whole.state, whole.covariance)
 
-    def foreseen(self, time_ns: int) -> Gaussian:
+    def foreseen(self, time_ns: int, readout_share: float) -> Gaussian:
         """Return the motion that an image at a time after the last frame may have.
 
         Its accelerations may have grown: what the image tells joins the window without this.
         """
-        deviations = enlarged(self.deviations, self.configured, _GROWN[-1])
-        return replace(self, deviations=deviations).after(time_ns)
+        grown = enlarged(self.deviations, self.configured, _GROWN[-1])
+        return self._ahead(time_ns, grown, readout_share, FADING)
 
-    def after(self, time_ns: int, lasting: float = FADING) -> Gaussian:
-        """Return the motion at a time after the last frame.
+    def _ahead(
+        self, time_ns: int, deviations: Array, readout_share: float, lasting: float
+    ) -> Gaussian:
+        """Return the motion after the last frame, with deviations (4,) of accelerations.
 
         ``lasting`` is the time (s) in which the accelerations fade that its covariance is of.
         """
@@ -280,7 +283,7 @@ class MotionWindow:
         if seconds == 0.0:
             return last
         state, transport, added = _predicted(
-            last.state, seconds, self.deviations, self.readout_share, float(lasting)
+            last.state, seconds, deviations, readout_share, lasting
         )
         return Gaussian(time_ns, state, transport @ last.covariance @ transport.T + added)
 
@@ -290,7 +293,7 @@ class MotionWindow:
         if time_ns < times[0]:
             return None
         if time_ns > times[-1]:
-            ahead = self.after(time_ns, _LASTING)
+            ahead = self._ahead(time_ns, self.deviations, self.readout_share, _LASTING)
             return ahead._replace(covariance=_FEW * ahead.covariance)
         if time_ns in times:
             return self.before(len(times) - 1 - times.index(time_ns))
@@ -331,7 +334,7 @@ class MotionWindow:
         learnt = found[0].deviations
         found += [solved(told, learnt, 0, grown) for grown in _GROWN]
         apart, away = _between(seconds, informations)
-        for swing in _SWINGS if np.median(apart) > _SLOW else ():
+        for swing in _SWINGS if statistics.median(apart.tolist()) > _SLOW else ():
             beside = _Swinging.of(states, told, swing * np.outer(apart, self.configured), away)
             found.append(beside.of_images(solved(beside.told, learnt, 0, 1.0)))
         return tuple(found)
@@ -524,34 +527,38 @@ def _told_by_points(covariance: Array2, known: Array2) -> Array:
     return told
 
 
-def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array, Array]:
-    """Return the motion without vibration, both covariances, and the derivative of that motion.
+def swing_of(estimate: Estimate) -> Array:
+    """Return the covariance (18,18) of the shaking about the motion without it.
 
     A camera that shakes is, in the middle row, somewhere on its swing; a frame later it is
     somewhere else on it.
     """
+    swing, squares = np.zeros((PARAMETERS, PARAMETERS)), np.square(estimate.shake).sum(axis=1) / 3.0
+    if len(squares):
+        swing[TURN, TURN] = (MIDDLE_VALUES[: len(squares)] ** 2 @ squares) * np.eye(3)
+        swing[ANGULAR, ANGULAR] = (MIDDLE_RATES[: len(squares)] ** 2 @ squares) * np.eye(3)
+    return swing
+
+
+def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array]:
+    """Return the motion without vibration, its covariance, and its derivative."""
     shake, joint = estimate.shake, estimate.joint_covariance
-    swing, jacobian = np.zeros((PARAMETERS, PARAMETERS)), _UNSHAKEN[:, : len(joint)]
-    motion = Motion(**numbers_by_name(estimate))
+    jacobian = _UNSHAKEN[:, : len(joint)]
     if not len(shake) and len(joint) == PARAMETERS:
-        return motion, joint, swing, jacobian
-    values, rates = MIDDLE_VALUES[: len(shake)], MIDDLE_RATES[: len(shake)]
-    turned = so3.exp(values @ shake)
-    still = replace(
-        motion, rotation=turned @ motion.rotation, translation=turned @ motion.translation,
-        angular_velocity=motion.angular_velocity - rates @ shake,
+        return estimate, joint, jacobian
+    turned = so3.exp(MIDDLE_VALUES[: len(shake)] @ shake)
+    still = altered(
+        estimate, rotation=turned @ estimate.rotation, translation=turned @ estimate.translation,
+        angular_velocity=estimate.angular_velocity - MIDDLE_RATES[: len(shake)] @ shake,
     )  # fmt: skip
-    squares = np.square(shake).sum(axis=1) / 3.0
-    swing[TURN, TURN] = (values**2 @ squares) * np.eye(3)
-    swing[ANGULAR, ANGULAR] = (rates**2 @ squares) * np.eye(3)
     covariance = jacobian @ joint @ jacobian.T
     # Pose and turn cancel: what rounding leaves of the difference of two large variances.
-    return still, 0.5 * (covariance + covariance.T), swing, jacobian
+    return still, 0.5 * (covariance + covariance.T), jacobian
 
 
 def gaussian_of(estimate: Estimate, time_ns: int) -> Gaussian:
     """Return the motion of one frame without vibration."""
-    motion, covariance, _, _ = unshaken(estimate)
+    motion, covariance, _ = unshaken(estimate)
     state, units = _per(state_in(motion, _ORIGIN), 1.0 / estimate.span)
     return Gaussian(time_ns, state, covariance * np.outer(units, units))
 
@@ -565,7 +572,7 @@ def told_of(
         known: what was known of that motion before, in the map's frame.
         rotation: beside which that is; None: it is of the whole motion.
     """
-    motion, covariance, _, _ = unshaken(estimate if rotation is None else rotation.beside(estimate))
+    motion, covariance, _ = unshaken(estimate if rotation is None else rotation.beside(estimate))
     information, slope = np.zeros((PARAMETERS,) * 2), np.zeros(PARAMETERS)
     state = state_in(motion, _ORIGIN)
     add_prior(known, state, 1.0, information, slope)
@@ -584,7 +591,7 @@ def estimate_at(estimate: Estimate, gaussian: Gaussian) -> Estimate:
     known, spread = gaussian.per_readout(estimate.span)
     if not len(estimate.shake):
         return estimate.with_joint_covariance(spread, **numbers_by_name(known), twist_known=True)
-    motion, covariance, _, jacobian = unshaken(estimate)
+    motion, covariance, jacobian = unshaken(estimate)
     joint = estimate.joint_covariance
     gain = np.linalg.solve(covariance, jacobian @ joint).T
     step = gain @ step_from(motion, known)

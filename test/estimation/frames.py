@@ -66,7 +66,7 @@ def changed(observations, points=None, gradient=None, rounded=0.0):
 
 def fitted(observations, start, prior, threshold):
     """The best motion near a state (24,)."""
-    return Posterior(*best_motion(observations.packed, observations.count, start, prior, threshold))
+    return Posterior(*best_motion(observations.packed, len(observations), start, prior, threshold))
 
 
 def distance(posterior, truth, parts):

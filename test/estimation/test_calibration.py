@@ -94,7 +94,9 @@ def inside(
     for seed in range(frames):
         points, pixels, true = frame(seed, depth, noise)
         landmarks, modes = mapped(points, seed)
-        found = localizer.accepted(localizer.find(landmarks, pixels, error_modes=modes))
+        found = localizer.accepted(
+            localizer.find(localizer.sights(landmarks, pixels), error_modes=modes)
+        )
         if not found:
             assert least < 1.0, str(found)
             continue

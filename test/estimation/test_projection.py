@@ -32,7 +32,7 @@ def test_robust_costs_are_those_of_the_formulas(softness):
     # A search's cost is that of its one look, which knows no accelerations.
     observations, state = frame(5, 0.15, 2.0, count=21)
     data = changed(observations, gradient=np.zeros(2)).packed
-    ratios = projection.squared_errors(data, observations.count, state) / 9.0
+    ratios = projection.squared_errors(data, len(observations), state) / 9.0
     assert (ratios > 1.0).any()
     assert (ratios < 1.0).any()
     truncated, tukey = np.minimum(ratios, 1.0), (1 - (1 - np.minimum(ratios, 1.0)) ** 3) / 3
@@ -47,7 +47,7 @@ def test_points_behind_the_camera_are_outliers_and_disturb_nothing():
     behind, axis = observations.points.copy(), state[6:9]
     behind[0] -= 2.0 * (axis @ behind[0] + state[11]) * axis
     data = changed(observations, behind).packed
-    squared = projection.squared_errors(data, observations.count, state)
+    squared = projection.squared_errors(data, len(observations), state)
     assert np.isinf(squared[0])
     assert squared[1:].max() < 1e-6
     found = np.empty((2, 18, 18))

@@ -36,7 +36,7 @@ def test_the_minimum_has_no_slope_of_the_posterior():
 
     def posterior(step):
         there = robust.apply_step(state, step)
-        errors = squared_errors(data, observations.count, there)
+        errors = squared_errors(data, len(observations), there)
         return errors.sum() + noise**2 * there[12:] @ (precisions * there[12:])
 
     slope = differences(posterior, 18, 1e-6)

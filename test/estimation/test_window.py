@@ -152,7 +152,7 @@ def test_between_frames_it_passes_through_both_and_after_them_it_spreads():
     turn = step_between(before.state, middle.state)[:3]
     halfway = 0.5 * step_between(before.state, last.state)[:3]
     np.testing.assert_allclose(turn, halfway, atol=3e-3 * SMALL)
-    grown = [np.trace(window.after(last.time_ns + ms * 10**6).covariance[:3, :3])
+    grown = [np.trace(window.at(last.time_ns + ms * 10**6).covariance[:3, :3])
              for ms in (0, 10, 30, 100)]  # fmt: skip
     assert np.all(np.diff(grown) > 0.0)
     assert window.at(window.start.time_ns - 1) is None

@@ -389,7 +389,7 @@ def test_a_frame_is_widened_by_what_it_shows_itself_of_the_other_axis():
         watch._across = True  # likely, by the frames before
         for cloud in given:
             found = localizer.localize(cloud.points, cloud.pixels)
-            watch.add(cloud.stamp_ns, found, cloud.points, cloud.pixels)
+            watch.add(cloud.stamp_ns, found, localizer.sights(cloud.points, cloud.pixels))
         widened.append(watch.widened(found).joint_covariance)
     np.testing.assert_array_equal(*widened)
 

@@ -67,9 +67,10 @@ def localize_each(
     rough = Localizer(camera, inlier_threshold=gate, calibration=_ANY_LENS)
     results = []
     for image in images:
-        result = localizer.find(image.points, image.pixels)
+        sights = localizer.sights(image.points, image.pixels)
+        result = localizer.find(sights)
         if isinstance(result, Failure) and result.reason in _OF_THE_LENS:
-            result = rough.find(image.points, image.pixels)
+            result = rough.find(sights)
         results.append(result)
         done()
     return results
