@@ -343,11 +343,12 @@ class MotionWindow:
 def _between(seconds: Array, informations: Array) -> tuple[Array, Array]:
     """Return times (n,) between images, of steps between samples, and how far one is from them.
 
-    A sample that tells nothing lies between two images. The slowest swing that neither shows has a
-    half of its period between them, and is away by its velocity times this time (n,), s.
+    A sample that tells nothing, and is not the last one, lies between two images. The slowest
+    swing that neither shows has a half of its period between them, and is away by its velocity
+    times this time (n,), s.
     """
     apart, away = seconds.copy(), np.zeros(len(seconds))
-    for k in np.flatnonzero(~informations.any(axis=(1, 2))):
+    for k in np.flatnonzero(~informations[:-1].any(axis=(1, 2))):
         apart[k : k + 2] = whole = seconds[k] + seconds[k + 1]
         away[k] = whole / math.pi * math.sin(math.pi * seconds[k] / whole)
     return apart, away

@@ -174,6 +174,15 @@ def test_between_two_frames_of_a_fast_camera_a_covariance_is_positive(seconds):
         assert np.linalg.eigvalsh(between / np.outer(scale, scale))[0] > 0.0
 
 
+def test_a_last_image_that_tells_nothing_lies_between_no_two():
+    rng = np.random.default_rng(4)
+    samples = samples_of(simulated(0.5 * HAND, 5, rng)[0], rng)
+    rare = [each._replace(time_ns=6 * each.time_ns) for each in samples]
+    nothing = rare[-1]._replace(information=np.zeros((18, 18)), gradient=np.zeros(18))
+    window = through([*rare[:-1], nothing])
+    assert np.isfinite(window.newest.covariance).all()
+
+
 UNITS = np.repeat([1.0, 1.0, SPAN, SPAN, SPAN**2, SPAN**2], 3)  # per readout
 
 
