@@ -81,9 +81,9 @@ _MOST_INNOVATION = 62.0
 # Of the logarithm of the odds of a vibration, the part that the next frame has of it: sizes and
 # spectra last for thirty frames, in which a motor is seen that no frame shows.
 _REMEMBERED = 0.97
-# How fast a camera may be that one image takes for slow, in configured deviations: it hardly turns,
-# and may be in an aircraft.
-_FAST = 20.0
+# How fast a camera may be (m/s) that one image takes for slow: it hardly turns, and may be in an
+# aircraft. Or faster, in configured deviations.
+_FAST, _FASTER = 60.0, 2.0
 # Covariance of a motion that is only a first guess.
 _UNKNOWN = np.diag(np.full(PARAMETERS, np.inf))
 # A frame that jumped is back where the one before the last was if it is nearer to it by this.
@@ -717,7 +717,8 @@ class Tracker:
 
     def _at_any_speed(self, result: Estimate) -> Estimate:
         """Return the motion of one image whose rows do not show how fast the camera is."""
-        faster = _FAST * self.localizer.config.velocity_prior.linear * result.span
+        configured = self.localizer.config.velocity_prior.linear
+        faster = max(_FAST, _FASTER * configured) * result.span if configured > 0.0 else 0.0
         joint = result.joint_covariance.copy()
         joint[LINEAR, LINEAR] += faster**2 * np.eye(3)
         return replace(result, joint_covariance=joint)
