@@ -35,6 +35,7 @@ from rs_localizer.core.state import (
     MOVE,
     PARAMETERS,
     POSE,
+    STATE_LINEAR,
     TURN,
     VELOCITIES,
 )
@@ -44,7 +45,7 @@ from rs_localizer.estimation.frames_together import CamerasTogether
 from rs_localizer.estimation.known_rotation import Aid, Foretold, LastFrame
 from rs_localizer.estimation.moved_part import MovedPart, MovedParts
 from rs_localizer.estimation.points import FrameSights
-from rs_localizer.estimation.prior import Prior, beside, predicted
+from rs_localizer.estimation.prior import Prior, at_speed, beside, predicted
 from rs_localizer.estimation.window import (
     FADING,
     LENGTH,
@@ -541,9 +542,8 @@ class Tracker:
             return None
         known = self.localizer.known_of(prior if found.tracked else None, found.span, rotation)
         if not (found.tracked or found.twist_known):
-            found, informations = self._at_any_speed(found), known.informations.copy()
-            informations[0, LINEAR] = 0.0
-            known = known._replace(informations=informations)
+            speed = self._possible_speed() * found.span
+            found, known = _as_fast(found, speed), at_speed(known, speed)
         try:
             return told_of(found, time_ns, known, rotation)
         except np.linalg.LinAlgError:
@@ -711,17 +711,22 @@ class Tracker:
             # behind is no Gaussian's. NaN, of rounding errors, is neither.
             if -1.0 < window.surprise < _MOST_INNOVATION:
                 return window
-        start = gaussian_of(self._at_any_speed(result), time_ns)
+        start = gaussian_of(_as_fast(result, self._fastest * result.span), time_ns)
         alone = MotionWindow.begin(start, self.localizer.config.acceleration, share)
         return alone if track is None else replace(alone, deviations=track.window.deviations)
 
-    def _at_any_speed(self, result: Estimate) -> Estimate:
-        """Return the motion of one image whose rows do not show how fast the camera is."""
+    @property
+    def _fastest(self) -> float:
+        """How fast (m/s) a camera may be that one image takes for slow."""
         configured = self.localizer.config.velocity_prior.linear
-        faster = max(_FAST, _FASTER * configured) * result.span if configured > 0.0 else 0.0
-        joint = result.joint_covariance.copy()
-        joint[LINEAR, LINEAR] += faster**2 * np.eye(3)
-        return replace(result, joint_covariance=joint)
+        return max(_FAST, _FASTER * configured) if configured > 0.0 else 0.0
+
+    def _possible_speed(self) -> float:
+        """Return how fast (m/s) the track is, as far as anybody knows."""
+        track = self._track
+        if track is None or len(track.window) == 1:
+            return self._fastest
+        return float(np.linalg.norm(track.window.newest.state[STATE_LINEAR]))
 
     def _beside_aid(self, track: _Track) -> Acceleration:
         """Return the accelerations beside the rotation that an aid reads."""
@@ -744,6 +749,13 @@ class Tracker:
         added[:, VELOCITIES] *= math.copysign(1.0, dt)
         fading = math.copysign(FADING, dt) / readout_time
         return LastFrame(track.time_ns, motion, covariance, added, fading)
+
+
+def _as_fast(found: Estimate, speed: float) -> Estimate:
+    """Return the motion of an image whose rows do not show whether it is so fast, m per readout."""
+    joint = found.joint_covariance.copy()
+    joint[LINEAR, LINEAR] += speed**2 * np.eye(3)
+    return replace(found, joint_covariance=joint)
 
 
 def _check_motion(localizer: Localizer) -> None:

@@ -224,7 +224,7 @@ def test_between_rare_images_a_shaken_hand_may_have_swung():
         assert tracker.localize(ns(t), *hand.frame(t, MAP, 120, 0.5, seed=k))
         if k > 1:
             lengths.append([off_at(tracker, t - 0.2 * ago, hand)[0] for ago in (0.1, 0.3, 0.5)])
-    assert np.mean(np.array(lengths) < INSIDE_6) > 0.8
+    assert np.mean(np.array(lengths) < INSIDE_6) > 0.7  # a fifth, without
     assert np.max(lengths) < 2.0 * FAR
 
 

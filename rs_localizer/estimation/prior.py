@@ -303,6 +303,13 @@ def knows_speed(terms: PriorTerms, prior: Prior) -> bool:
     return bool(np.all(np.diagonal(np.asarray(prior.covariance))[LINEAR] * default < 1.0))
 
 
+def at_speed(terms: PriorTerms, speed: float) -> PriorTerms:
+    """Return the terms of a camera that may be so fast, m per readout, whatever is configured."""
+    informations = terms.informations.copy()
+    informations[0, LINEAR] /= 1.0 + informations[0, LINEAR.start, LINEAR.start] * speed**2
+    return terms._replace(informations=informations)
+
+
 def with_motion(
     terms: PriorTerms, prior: Prior, centre: Array, turn_known: bool = False
 ) -> PriorTerms:
@@ -315,13 +322,11 @@ def with_motion(
         return terms
     covariance = np.ascontiguousarray(prior.covariance, np.float64)
     if len(covariance) == PARAMETERS:  # it knows the accelerations better than a default
-        better = knows_speed(terms, prior)
         terms = terms._replace(informations=terms.informations.copy())
         terms.informations[0, ACCELERATIONS] = 0.0
-        if better:  # a default may be that of slower cameras
-            terms.informations[0] = 0.0
-        elif turn_known:
+        if turn_known:
             terms.informations[0][_TURNING] = 0.0
+        terms = at_speed(terms, float(np.linalg.norm(prior.motion.linear_velocity)))
     information = _information_of(covariance)
     return _with_term(terms, information, state_in(prior.motion, centre), pivot_of(covariance))
 
