@@ -23,7 +23,7 @@ from rs_localizer.cli.recording_input import (
     check_there,
     each_image,
     find_map,
-    given_settings,
+    given_values,
     recorded,
     remapped,
 )
@@ -46,11 +46,15 @@ if WORKING:
     from rs_localizer.offline.recordings import optical_frame, read_imu_recording
     from rs_localizer.offline.replay import has_frames
     from rs_localizer.pipeline.marker_detector import FrameDetector
-    from rs_localizer.settings import write_parameters
+    from rs_localizer.settings import build, write_parameters
     from rs_localizer.tools import verdict
     from rs_localizer.tools.adjust.intrinsics import LensErrors
     from rs_localizer.tools.adjust.observe import ImagePoints, in_order
-    from rs_localizer.tools.camera_calibration import CameraCalibration, calibrate
+    from rs_localizer.tools.camera_calibration import (
+        CameraCalibration,
+        calibrate,
+        calibrate_either_axis,
+    )
     from rs_localizer.tools.first_lens import first_lens
     from rs_localizer.tools.rig_mounts import calibrate_rig
 
@@ -110,7 +114,9 @@ def run(options: Options) -> Mapping[str, object]:
         options = replace(options, assignments=["readout_time:=0.03", *options.assignments])
     elif len(options.recordings) > 1:
         raise UsageError("several recordings are those of a --rig")
-    config = given_settings(options)
+    given = given_values(options)
+    config = build(given)
+    any_axis = not any(name.rpartition(".")[2] == "scan_direction" for name in given)
     cameras = {"": (replace(options, recording=options.recordings[0]), "")}
     if options.rig:
         cameras = cameras_of(options, options.recordings, config)
@@ -126,7 +132,7 @@ def run(options: Options) -> Mapping[str, object]:
         axis = config.of_cameras.get(name, config).scan_direction
         source = _read(own, replace(config, scan_direction=axis))
         sources[name] = replace(source, camera=replace(source.camera, scan_direction=axis))
-        found[name] = _calibrated(own, sources[name], config)
+        found[name] = _calibrated(own, sources[name], config, any_axis)
     if options.rig:
         frames = {name: frame for name, (_, frame) in cameras.items()}
         _mount(options, sources, found, config, frames)
@@ -169,10 +175,13 @@ def _lens_writers(args: Options, cameras: Mapping[str, Camera]) -> Writers:
     return {files[name]: partial(write_calibration, camera=cameras[name]) for name in files}
 
 
-def _calibrated(args: Options, source: _Input, config: NodeConfig) -> CameraCalibration:
-    """Calibrate a camera by its images and print the result."""
+def _calibrated(
+    args: Options, source: _Input, config: NodeConfig, any_axis: bool
+) -> CameraCalibration:
+    """Calibrate a camera by its images and print the result; ``any_axis``: none was given."""
+    one = calibrate_either_axis if any_axis else calibrate
     with tqdm(total=len(source.images), unit="image", desc="localize", disable=None) as bar:
-        found = calibrate(
+        found = one(
             source.camera, source.images, intrinsics=source.find_lens, imu=source.imu,
             own_stamps=source.own_stamps, done=bar.update,
         )  # fmt: skip

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.scanning import REVERSED, ScanDirection
+from rs_localizer.core.scanning import ACROSS, REVERSED, ScanDirection
 from rs_localizer.io.imu import ImuRecording
 from rs_localizer.localizer import Localizer
 from rs_localizer.tools.adjust.fit import Fit, cheaper, fit, image_speeds
@@ -151,6 +151,7 @@ class CameraCalibration:
     lens: LensErrors  # standard deviations of the lens that was found
     mount: MountFound | None = None  # of the IMU, where there is one
     no_mount: str = ""  # why there is none
+    other_axis: bool = False  # the scan runs across the axis that was assumed
 
     @property
     def limit(self) -> float:
@@ -258,6 +259,24 @@ class CameraCalibration:
             turn = Rotation.align_vectors(one, other)[0]
             apart = float(np.mean(np.sum((one - turn.apply(other)) ** 2, axis=1)))
         return math.sqrt(3.0 * self.inflation**2 * float(np.mean(variances)) + 0.25 * apart)
+
+
+def calibrate_either_axis(
+    camera: Camera, images: list[ImagePoints], **known: Any
+) -> CameraCalibration:
+    """Calibrate as :func:`calibrate`, and along the other axis if the film seems processed.
+
+    The other axis is returned if its readout time is believed and it leaves less noise: an image
+    that is scanned across the assumed axis looks like one of a stabilizer.
+    """
+    found = calibrate(camera, images, **known)
+    if found.processed:
+        across = replace(camera, scan_direction=ACROSS[ScanDirection(camera.scan_direction)])
+        with suppress(ValueError):  # a wrong axis may determine nothing
+            other = calibrate(across, images, **known)
+            if not other.disbelief and other.fit.deviation < found.fit.deviation:
+                return replace(other, other_axis=True)
+    return found
 
 
 def calibrate(

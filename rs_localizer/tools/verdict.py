@@ -63,6 +63,11 @@ def remarks(result: CameraCalibration) -> Iterator[str]:
             f"global shutter: 0 lies within the error of {1e3 * result.readout_time:+.3f} +- "
             f"{1e3 * result.deviation:.3f} ms"
         )
+    if result.other_axis:
+        yield (
+            "rows are exposed along the other axis than assumed: scan_direction: "
+            f"{scan_direction(result)}"
+        )
     if result.stamps.irregular:
         yield f"stamps are irregular: {1e3 * result.stamps.jitter:.2f} ms rms about even intervals"
     if result.jitter > _WORTH_A_WORD:

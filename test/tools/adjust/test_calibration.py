@@ -13,7 +13,12 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.io.imu import ImuRecording
 from rs_localizer.tools import verdict
 from rs_localizer.tools.adjust.observe import ImagePoints
-from rs_localizer.tools.camera_calibration import CameraCalibration, calibrate, is_turned
+from rs_localizer.tools.camera_calibration import (
+    CameraCalibration,
+    calibrate,
+    calibrate_either_axis,
+    is_turned,
+)
 from rs_localizer.tools.first_lens import first_lens
 
 CAMERA = projector.make_camera()
@@ -22,13 +27,13 @@ CAMERA = projector.make_camera()
 @cache
 def recording(
     readout: float = 0.02, points: str = "board", turn: float = 0.1, seconds: float = 2.5,
-    outliers: float = 0.0, noise: float = 0.1, seed: int = 21,
+    outliers: float = 0.0, noise: float = 0.1, seed: int = 21, axis: int = 1,
 ) -> tuple[ImagePoints, ...]:  # fmt: skip
     rng = np.random.default_rng(seed)
     motion = projector.Motion.random(rng, turn, 0.8 * turn)
     landmarks = projector.board() if points == "board" else projector.room(rng)
     frames = projector.record(rng, motion, landmarks, readout=readout, seconds=seconds,
-                              noise=noise, outliers=outliers)  # fmt: skip
+                              noise=noise, outliers=outliers, axis=axis)  # fmt: skip
     return tuple(ImagePoints(round(1e9 * (10.0 + f.stamp)), f.points, f.pixels) for f in frames)
 
 
@@ -67,6 +72,15 @@ def test_a_global_shutter_is_one():
     processed = replace(found, own_stamps=False)
     assert "no proof of a global shutter" in processed.disbelief
     assert verdict.readout_time(replace(processed, readout_time=0.004)) == 0.004
+
+
+def test_the_other_axis_is_found_where_rows_seem_to_rotate():
+    """A film of a column shutter looks stabilized along the rows, and its lens is far off."""
+    found = calibrate_either_axis(CAMERA, list(recording(-0.02, axis=0)), intrinsics=True)
+    agrees(found, -0.02, 1e-4)
+    assert found.disbelief == ""
+    assert found.fit.camera.K[0, 0] == pytest.approx(CAMERA.K[0, 0], rel=2e-3)
+    assert "scan_direction: right_to_left" in " ".join(verdict.remarks(found))
 
 
 def test_a_camera_at_rest_determines_nothing():
