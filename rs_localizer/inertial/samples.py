@@ -49,11 +49,22 @@ _WIDTH = 9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuSamples:
-    """Samples (n) in the order of their times, in the axes of the camera or of the IMU."""
+    """Samples (n) in the order of their times, in the axes of the camera or of the IMU.
+
+    Raises:
+        ValueError: for times that do not increase.
+    """
 
     times_ns: IntArray  # (n,) by the clock of the same one, increasing
     angular_velocity: Array  # (n,3) rad/s
     specific_force: Array | None = None  # (n,3) m/s^2, upwards at rest; None: not all have one
+
+    def __post_init__(self) -> None:
+        steps = np.diff(self.times_ns)
+        if len(steps) and steps.min() <= 0:
+            k = int(steps.argmin())
+            before, then = self.times_ns[k : k + 2].tolist()
+            raise ValueError(f"times_ns must increase, got {then} ns after {before} ns")
 
     def __len__(self) -> int:
         return len(self.times_ns)

@@ -129,3 +129,8 @@ def test_memory_is_bounded():
         rush.add(START + 10_000 * i - 5_000, "imu", (0.0, 0.0, 0.0))
     assert MOST <= len(rush) <= 2 * MOST
     assert lack(rush.between(START + 399_000_000, START + 399_500_000)) is None
+
+
+def test_times_that_repeat_are_refused():
+    with pytest.raises(ValueError, match="must increase, got 7 ns after 7 ns"):
+        ImuSamples(np.array([5, 7, 7, 9]), np.zeros((4, 3)))
