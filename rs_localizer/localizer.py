@@ -108,8 +108,8 @@ def _or_else(found: Estimate, tracked: Estimate) -> Estimate:
     Either the camera has gone farther, or a wrong lens shows it so.
     """
     step = step_from(found, tracked)[:MOTION_PARAMETERS]
-    moment = found.calibration_covariance + np.outer(step, step)
-    return altered(found, calibration_covariance=moment)
+    moment = found.moved_covariance + np.outer(step, step)
+    return altered(found, moved_covariance=moment)
 
 
 def _contradiction(found: Estimate, prior: Prior) -> str:
@@ -527,4 +527,7 @@ class Localizer:
                 effect = effect_of(parts.part)
         effect = widened(effect, posterior)
         estimate = estimate_of(observed, posterior, best.samples, effect, tracked)
-        return altered(estimate, left_out=odd.notice, moved_covariance=other)
+        if odd.surely:
+            return altered(estimate, left_out=odd.notice, moved_covariance=other)
+        other = estimate.calibration_covariance + other
+        return altered(estimate, left_out=odd.notice, calibration_covariance=other)

@@ -481,10 +481,9 @@ class Tracker:
         self.pace.returns(away)
 
         def alone() -> Estimate | Failure:
-            if not result.tracked:
+            held_back = self.lens.is_beyond(result) or self.pace.is_odd
+            if not (result.tracked and held_back):
                 return result
-            if not (self.lens.is_beyond(result) or self.pace.is_odd):
-                return Failure(Reason.AWAITS_FRAMES, "")
             return self.localizer.accepted(self.localizer.find(sights))
 
         self.pace.add(time_ns, result, sights.points, alone)

@@ -74,8 +74,8 @@ class Estimate(Motion):
     undetected_covariance: Array = field(
         default_factory=np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)).copy
     )
-    # (12,12) part of ``covariance`` that points with a motion of their own cause: either they or
-    # all others lie elsewhere than the map says
+    # (12,12) part of ``covariance`` that a second, less probable explanation causes, as points with
+    # a motion of their own: either they or all others lie elsewhere than the map says
     moved_covariance: Array = field(
         default_factory=np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS)).copy
     )

@@ -107,6 +107,8 @@ class LeftOut(NamedTuple):
     """Second moment of the motion of points that are left out, about the frame's."""
     group: BoolArray = np.zeros(0, np.bool_)
     """(n,) these points; empty: none."""
+    surely: bool = True
+    """Whether the world has the frame's motion, and not that one, as far as their numbers tell."""
 
 
 class _Group(NamedTuple):
@@ -163,12 +165,14 @@ def left_out(
         f"their own, {math.degrees(turn):.1f} deg and {move:.2g} m away"
     )
     faster = max(posterior.speeding - speeding(observed, second.state), 0.0)
-    if _odds(found, size, faster) > (1.0 if known else _LEAST_ODDS):
+    odds = _odds(found, size, faster)
+    if odds > (1.0 if known else _LEAST_ODDS):
         # A part is one thing, however many of its landmarks a frame shows: either may have moved.
         moment = np.outer(step, step) + second.covariance
         other = size / (found + size) * moment[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
         text = f"{text}: have these points been moved, or do they move?"
-        return LeftOut(None, text, other, second.chosen)
+        surely = math.log(odds) > _LEAST_CHANCE
+        return LeftOut(None, text, other, second.chosen, surely)
     return LeftOut(Failure(
         Reason.MODEL_ERROR,
         f"{text}: which of both is the camera's? A part of the map was moved, or the calibration "
