@@ -94,18 +94,19 @@ def _is_bent(found: Estimate) -> bool:
     return found.model_error > BENT * found.declared_error
 
 
-def _leaves_out(found: Estimate | Failure, tracked: Estimate) -> bool:
-    """Return whether a motion leaves out what bends a track: what creeps away.
+def _leaves_out(found: Estimate, tracked: Estimate) -> bool:
+    """Return whether a motion leaves out the points that bend a track, which creep away.
 
     A motion that fits all points does not: before a wrong lens the track is the better one.
     """
-    return bool(found and np.count_nonzero(tracked.inliers & ~found.inliers) > SAMPLE)
+    return bool(np.count_nonzero(tracked.inliers & ~found.inliers) > SAMPLE)
 
 
-def _or_else(found: Estimate, tracked: Estimate) -> Estimate:
-    """Return a motion that allows for a track of which nobody knows how fast it is.
+def _with_other(found: Estimate, tracked: Estimate) -> Estimate:
+    """Return a motion whose region also holds the motion that the track has found.
 
-    Either the camera has gone farther, or a wrong lens shows it so.
+    Nobody knows how fast the track is: either the camera has gone farther, or a wrong lens shows
+    it so.
     """
     step = step_from(found, tracked)[:MOTION_PARAMETERS]
     moment = found.moved_covariance + np.outer(step, step)
@@ -337,7 +338,7 @@ class Localizer:
             if _leaves_out(found, tracked):
                 return found
             if not knows_speed(observed.terms, prior):
-                return _or_else(found, tracked)
+                return _with_other(found, tracked)
         return altered(tracked, tracked=True)
 
     def _searched(self, observed: Observed) -> Estimate | Failure:

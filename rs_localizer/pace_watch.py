@@ -82,7 +82,7 @@ class PaceWatch:
             time_ns: of the frame.
             found: its pose.
             points: (n,3) of the frame.
-            alone: localizes the frame without what is known of motion, which holds a camera back.
+            alone: returns its pose without a prior of the motion, where one holds the pose back.
         """
         places = self._places
         if places and not 0.0 <= 1e-9 * (time_ns - places[-1][0]) < _LONGEST_STEP:

@@ -474,6 +474,7 @@ class Tracker:
     def _compare_pace(
         self, time_ns: int, result: Estimate, jumped: bool, sights: FrameSights
     ) -> None:
+        """Compare a pose with those before it, which may alternate, or move impossibly."""
         away, before = None, self._seen[-2].found if len(self._seen) > 1 else None
         if jumped and self._track is not None and before:
             step, back = (step_from(one, result)[POSE] for one in (self._track.estimate, before))
@@ -751,7 +752,7 @@ class Tracker:
 
 
 def _as_fast(found: Estimate, speed: float) -> Estimate:
-    """Return the motion of an image whose rows do not show whether it is so fast, m per readout."""
+    """Return an estimate that may be faster by ``speed``, m per readout: its rows hardly tell."""
     joint = found.joint_covariance.copy()
     joint[LINEAR, LINEAR] += speed**2 * np.eye(3)
     return replace(found, joint_covariance=joint)

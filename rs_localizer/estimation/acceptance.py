@@ -141,8 +141,8 @@ def uncertain(estimate: Estimate) -> Failure | None:
     """Return why an estimate is too uncertain to be published, or None.
 
     What points do not tell because the camera may move, its covariance says: a global-shutter
-    estimator, which takes the camera for one at rest, would publish that pose. Nor does it refuse
-    one that most points tell, and others, which may have been moved, deny.
+    estimator, which takes the camera for one at rest, would publish that pose. A pose is not
+    refused, either, because a few points deny it, which may have been moved.
     """
     still, most = estimate.still_deviation, MOST_TURN
     turn = (estimate.covariance - estimate.moved_covariance)[TURN, TURN]

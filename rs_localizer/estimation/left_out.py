@@ -108,7 +108,7 @@ class LeftOut(NamedTuple):
     group: BoolArray = np.zeros(0, np.bool_)
     """(n,) these points; empty: none."""
     surely: bool = True
-    """Whether the world has the frame's motion, and not that one, as far as their numbers tell."""
+    """Whether the frame's motion is the world's, and not the group's, at odds of a thousand."""
 
 
 class _Group(NamedTuple):

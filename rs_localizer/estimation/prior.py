@@ -304,7 +304,7 @@ def knows_speed(terms: PriorTerms, prior: Prior) -> bool:
 
 
 def at_speed(terms: PriorTerms, speed: float) -> PriorTerms:
-    """Return the terms of a camera that may be so fast, m per readout, whatever is configured."""
+    """Return terms whose linear velocity may also be as large as ``speed``, m per readout."""
     informations = terms.informations.copy()
     informations[0, LINEAR] /= 1.0 + informations[0, LINEAR.start, LINEAR.start] * speed**2
     return terms._replace(informations=informations)
