@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import Acceleration
-from rs_localizer.core.arrays import Array, Array2, BoolArray, BoolArray1
+from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray, BoolArray1
 from rs_localizer.core.state import POSE
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.moved_part import keys_of, likeness
+from rs_localizer.estimation.moved_part import keys_of
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.estimation.window import acceleration_covariance, step_from
 from rs_localizer.native import entry
@@ -54,6 +54,36 @@ _NEIGHBOURS, _MOST = 4, 200
 _BY_CHANCE, _MOST_LANDMARKS = 1e-8, 20_000
 # Bound of a frame's log odds.
 _MOST_ODDS = 8.0
+
+
+@entry
+def likeness(points: Array2, numbers: Array1, neighbours: int) -> float:
+    """Return the mean product of numbers (n,) of points (n,3) and of their neighbours."""
+    extents = [np.max(points[:, axis]) - np.min(points[:, axis]) for axis in range(3)]
+    sorted_by = np.argmax(np.array(extents))
+    order = points[:, sorted_by].copy().argsort()
+    points, numbers = points[order], numbers[order]
+    count, total = len(points), 0.0
+    far, near = np.empty(neighbours), np.empty(neighbours)
+    for i in range(count):
+        far[:] = np.inf
+        for step in (-1, 1):  # both ways, until all others are farther along that axis alone
+            j = i + step
+            while 0 <= j < count:
+                if not (points[i, sorted_by] - points[j, sorted_by]) ** 2 < far[neighbours - 1]:
+                    break
+                square = 0.0
+                for axis in range(3):
+                    square += (points[i, axis] - points[j, axis]) ** 2
+                if square < far[neighbours - 1]:
+                    place = neighbours - 1
+                    while place > 0 and square < far[place - 1]:
+                        far[place], near[place] = far[place - 1], near[place - 1]
+                        place -= 1
+                    far[place], near[place] = square, numbers[j]
+                j += step
+        total += numbers[i] * near.sum()
+    return total / (count * neighbours)
 
 
 @entry

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, rotation_of
 from rs_localizer.estimation.hypotheses import Posterior
@@ -31,13 +31,11 @@ from rs_localizer.estimation.prior import PriorTerms
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.robust import LEAST_NOISE, TINY, WIDEST_GATE
 from rs_localizer.estimation.search import GLOBAL_SHUTTER_SCALE
-from rs_localizer.native import entry
 
-# Frames that are compared, and after how many others at most.
-_LOOKS, _RARELY = 4, 60
-# Neighbours of a landmark that are compared with it, deviations of chance by which they are alike,
-# and landmarks that are enough.
-_NEIGHBOURS, _ALIKE, _COMPARED = 4, 2.0, 200
+# Frames that are compared, and after how many others at most: that takes as long as three frames.
+_LOOKS, _RARELY = 4, 120
+# Landmarks that are enough.
+_COMPARED = 200
 # Splits that chance makes in one search of 1,000.
 _LEAST_CHANCE = -math.log(1e-3)
 # Declared deviations of two landmarks within which they are no two parts.
@@ -174,14 +172,7 @@ class MovedParts:
         stays = part is not None and _mostly_out(part.points, points, posterior.inliers)
         if not self._looks and self._count < self._next:
             return
-        look = look_at(observed, posterior, terms)
-        if not self._looks:
-            self._next += min(self._count, _RARELY)
-            if not neighbours_alike(look):
-                if not stays:
-                    self.part = self.named = None
-                return
-        self._looks.append(look)
+        self._looks.append(look_at(observed, posterior, terms))
         if len(self._looks) in (1, _LOOKS):
             found = moved_part(self._looks, self._map_deviation)
             if found is not None or (len(self._looks) == _LOOKS and not stays):
@@ -206,50 +197,12 @@ def _mostly_out(landmarks: Array, points: Array, inliers: BoolArray) -> bool:
     return bool(2 * np.count_nonzero(here & inliers) < np.count_nonzero(here))
 
 
-def neighbours_alike(look: Look) -> bool:
-    """Return whether errors of landmarks that are neighbours are alike, more than by chance.
+class _Beside(NamedTuple):
+    """What motions and smooth errors take up of the points that are kept."""
 
-    Moran's I, of both coordinates: it takes a fraction of what a search for parts does.
-    """
-    some = slice(None, None, 1 + len(look.points) // _COMPARED)
-    places, errors = look.points[some], look.rows[some, :, 0]
-    count = len(errors)
-    if count <= 2 * _NEIGHBOURS:
-        return False
-    off, places = errors - errors.mean(axis=0), np.ascontiguousarray(places)
-    products = sum(likeness(places, each.copy(), _NEIGHBOURS) for each in off.T)
-    index = count * products / max(float(np.sum(off**2)), TINY)
-    return index + 1.0 / count > _ALIKE / math.sqrt(2.0 * count * _NEIGHBOURS / 1.5)
-
-
-@entry
-def likeness(points: Array2, numbers: Array1, neighbours: int) -> float:
-    """Return the mean product of numbers (n,) of points (n,3) and of their neighbours."""
-    extents = [np.max(points[:, axis]) - np.min(points[:, axis]) for axis in range(3)]
-    sorted_by = np.argmax(np.array(extents))
-    order = points[:, sorted_by].copy().argsort()
-    points, numbers = points[order], numbers[order]
-    count, total = len(points), 0.0
-    far, near = np.empty(neighbours), np.empty(neighbours)
-    for i in range(count):
-        far[:] = np.inf
-        for step in (-1, 1):  # both ways, until all others are farther along that axis alone
-            j = i + step
-            while 0 <= j < count:
-                if not (points[i, sorted_by] - points[j, sorted_by]) ** 2 < far[neighbours - 1]:
-                    break
-                square = 0.0
-                for axis in range(3):
-                    square += (points[i, axis] - points[j, axis]) ** 2
-                if square < far[neighbours - 1]:
-                    place = neighbours - 1
-                    while place > 0 and square < far[place - 1]:
-                        far[place], near[place] = far[place - 1], near[place - 1]
-                        place -= 1
-                    far[place], near[place] = square, numbers[j]
-                j += step
-        total += numbers[i] * near.sum()
-    return total / (count * neighbours)
+    columns: Array  # (f,2m,p)
+    inverses: Array  # (f,p,p), of their products
+    freedom: float  # that they leave
 
 
 class _Frames(NamedTuple):
@@ -319,9 +272,11 @@ def moved_part(looks: Sequence[Look], map_deviation: float) -> MovedPart | None:
     frames = _Frames.of(looks)
     fitting: BoolArray = np.any(frames.inliers, axis=0)
     nobody = np.zeros(len(fitting), np.bool_)
-    alone = _fitted(frames, nobody, frames.inliers, declared=False)
-    starts = [_side(frames, fitting), ~fitting][: 1 if fitting.all() else 2]
-    splits = [split for start in starts if (split := _settled(frames, start))]
+    beside = _beside(frames, frames.inliers, declared=False)
+    alone = _fitted(frames, nobody, frames.inliers, beside)
+    starts = [_side(frames, fitting, beside), ~fitting][: 1 if fitting.all() else 2]
+    beside = _beside(frames, frames.shown, declared=True)
+    splits = [split for start in starts if (split := _settled(frames, start, beside))]
     best = max(splits, key=lambda split: split.gain, default=None)
     if best is None or best.gain < alone.evidence + _LEAST_CHANCE:
         return None
@@ -333,13 +288,10 @@ def moved_part(looks: Sequence[Look], map_deviation: float) -> MovedPart | None:
     return MovedPart(frames.points[part], frames.points[rest], way)
 
 
-def _beside(frames: _Frames, kept: BoolArray, declared: bool) -> tuple[Array, Array, float]:
+def _beside(frames: _Frames, kept: BoolArray, declared: bool) -> _Beside:
     """Return what motions and smooth errors take up of the points (f,m) that are kept.
 
     ``declared``: smooth errors are as large as is declared, and not as without a part.
-
-    Returns:
-        columns (f,2m,p), the inverse (f,p,p) of their products, and the freedom that they leave.
     """
     flat = (frames.columns * kept[:, :, None, None]).reshape(len(kept), -1, frames.columns.shape[3])
     normal = np.swapaxes(flat, 1, 2) @ flat
@@ -347,12 +299,13 @@ def _beside(frames: _Frames, kept: BoolArray, declared: bool) -> tuple[Array, Ar
     places = np.arange(weight.shape[1])
     weight[:, places, places] *= 1.0 + _RIDGE
     inverse = np.asarray(np.linalg.inv(weight), np.float64)
-    return flat, inverse, 2.0 * np.count_nonzero(kept) - float(np.sum(inverse * normal))
+    freedom = 2.0 * np.count_nonzero(kept) - float(np.sum(inverse * normal))
+    return _Beside(flat, inverse, freedom)
 
 
-def _fitted(frames: _Frames, part: BoolArray, kept: BoolArray, declared: bool) -> _Shifted:
+def _fitted(frames: _Frames, part: BoolArray, kept: BoolArray, beside: _Beside) -> _Shifted:
     """Fit motions, smooth errors and the shift of a part to the points (f,m) that are kept."""
-    flat, inverse, freedom = _beside(frames, kept, declared)
+    flat, inverse, freedom = beside
     own = frames.rows * kept[:, :, None, None]
     own[..., 1:] *= part[:, None, None]
     own = own.reshape(len(own), -1, 4)
@@ -372,9 +325,12 @@ def _fitted(frames: _Frames, part: BoolArray, kept: BoolArray, declared: bool) -
     return _Shifted(way, np.sum(each**2, axis=3) * frames.shown, evidence)
 
 
-def _settled(frames: _Frames, part: BoolArray) -> _Split | None:
-    """Let each landmark join the group that it fits, until none changes; None if one vanishes."""
-    kept, fit = frames.shown, _fitted(frames, part, frames.shown, declared=True)
+def _settled(frames: _Frames, part: BoolArray, beside: _Beside) -> _Split | None:
+    """Let each landmark join the group that it fits, until none changes; None if one vanishes.
+
+    Motions and smooth errors are, at first, those ``beside`` all landmarks that are shown.
+    """
+    kept, fit = frames.shown, _fitted(frames, part, frames.shown, beside)
     for _ in range(_ROUNDS):
         before, costs = (part, kept), fit.each.sum(axis=1)
         part = costs[1] < costs[0]
@@ -383,7 +339,7 @@ def _settled(frames: _Frames, part: BoolArray) -> _Split | None:
             return None
         if np.array_equal(part, before[0]) and np.array_equal(kept, before[1]):
             break
-        fit = _fitted(frames, part, kept, declared=True)
+        fit = _fitted(frames, part, kept, _beside(frames, kept, declared=True))
     found: BoolArray = np.any(kept, axis=0)
     count, size = int(np.count_nonzero(found)), int(np.count_nonzero(part & found))
     if not _OF_SHIFT < size < count:
@@ -393,9 +349,9 @@ def _settled(frames: _Frames, part: BoolArray) -> _Split | None:
     return _Split(fit.evidence - choices, part & found, ~part & found, fit.way)
 
 
-def _side(frames: _Frames, fitting: BoolArray) -> BoolArray:
+def _side(frames: _Frames, fitting: BoolArray, beside: _Beside) -> BoolArray:
     """Return the side of a plane through the map whose shift explains most."""
-    columns, inverses, _ = _beside(frames, frames.inliers, declared=False)
+    columns, inverses, _ = beside
     away = frames.points - frames.points[fitting].mean(axis=0)
     values, axes = np.linalg.eigh(away[fitting].T @ away[fitting])
     places = away @ axes / np.sqrt(np.maximum(values, 1e-4 * values[-1])) @ _ALONG.T

@@ -32,7 +32,7 @@ def said(fault: kinds.Fault, **fields: Any) -> tuple[set[int], set[int], str]:
         return told
 
     kind = kinds.Kind("half map moved 1 cm, corner", kinds._corner, observed, **fields)
-    text = kinds.judged(kind, 2).texts.get("stale_landmarks", "")
+    text = kinds.judged(kind, 3).texts.get("stale_landmarks", "")
     ids = text.rpartition(": ")[2].removesuffix(" ...")
     return moved, {int(name) for name in ids.split(", ") if name}, text
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rs_localizer.estimation import projection
-from rs_localizer.estimation.moved_part import likeness
 from rs_localizer.estimation.robust import apply_step
+from rs_localizer.integrity import likeness
 
 from .frames import changed, differences, frame
 
