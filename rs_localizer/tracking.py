@@ -77,6 +77,9 @@ _LEAST_STEP_NS, _MOST_TOO_CLOSE = 100_001, 10
 _COUNTED, _SINCE_1970 = 1_000_000, ((10**9, 4 * 10**9), (10**12, 4 * 10**12))
 # Weight of the newest frame in the share of inliers of the last frames.
 _NEWEST = 0.3
+# Least part of its inliers that a frame keeps by the motion of all frames: fewer, and they do not
+# hang together. (Right tracks of the paired set and of 15 real boards keep more.)
+_STILL_FITTING = 0.7
 # Largest squared distance of a searched motion from the track: once in a million by chance.
 _MOST_INNOVATION = 62.0
 # Of the logarithm of the odds of a vibration, the part that the next frame has of it: sizes and
@@ -634,7 +637,11 @@ class Tracker:
             residuals = seen.sights.residuals(found)
             if isinstance(found.residuals, ByCamera):
                 residuals = found.residuals.like(residuals)
-            seen.found = altered(found, residuals=residuals, inliers=residuals <= seen.gate)
+            inliers = residuals <= seen.gate
+            if np.count_nonzero(inliers) >= _STILL_FITTING * np.count_nonzero(found.inliers):
+                seen.found = altered(found, residuals=residuals, inliers=inliers)
+            elif seen.time_ns == self._track.time_ns:
+                self._track.window = self._alone(seen.found, window.readout_share, window)
 
     def _covering(self, result: Estimate) -> Estimate:
         """Return the estimate with velocities as uncertain as frames show them, if rows may not.
@@ -711,9 +718,15 @@ class Tracker:
             # behind is no Gaussian's. NaN, of rounding errors, is neither.
             if -1.0 < window.surprise < _MOST_INNOVATION:
                 return window
-        start = gaussian_of(_as_fast(result, self._fastest * result.span), time_ns)
-        alone = MotionWindow.begin(start, self.localizer.config.acceleration, share)
-        return alone if track is None else replace(alone, deviations=track.window.deviations)
+        return self._alone(result, share, None if track is None else track.window)
+
+    def _alone(
+        self, result: Estimate, readout_share: float, before: MotionWindow | None
+    ) -> MotionWindow:
+        """Return the window of a frame that those before it do not predict."""
+        start = gaussian_of(_as_fast(result, self._fastest * result.span), result.time_ns)
+        alone = MotionWindow.begin(start, self.localizer.config.acceleration, readout_share)
+        return alone if before is None else replace(alone, deviations=before.deviations)
 
     @property
     def _fastest(self) -> float:
