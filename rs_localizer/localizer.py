@@ -345,7 +345,12 @@ class Localizer:
         # 3. A global-shutter start, then hypotheses of the solver (LO-RANSAC).
         best = self._search.find(observed)
         if not best.found:
-            return Failure(Reason.NO_HYPOTHESIS, "no three points gave a pose")
+            most = int(np.bincount(observed.observations.camera).max(initial=0))
+            return Failure(
+                Reason.NO_HYPOTHESIS,
+                f"no three points gave a pose: {most} at most are of one camera, or on one side of "
+                "a cube about a wide one",
+            )
         if self.config.refinement == RefinementKind.NONE:
             return self._minimal(observed, best)
         # 4. Maximum a posteriori on the inliers; rest or motion; the leans of a plane.
