@@ -198,7 +198,7 @@ def _mostly_out(landmarks: Array, points: Array, inliers: BoolArray) -> bool:
 
 
 class _Beside(NamedTuple):
-    """What motions and smooth errors take up of the points that are kept."""
+    """The part of the kept points that motions and smooth errors take up."""
 
     columns: Array  # (f,2m,p)
     inverses: Array  # (f,p,p), of their products
