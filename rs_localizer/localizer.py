@@ -334,10 +334,15 @@ class Localizer:
         found = self._searched(observed)
         if not tracked or prior is None:
             return found
-        if found and not _is_bent(found):
-            if _leaves_out(found, tracked):
+        if found:
+            is_bent = _is_bent(found)
+            if not is_bent and _leaves_out(found, tracked):
                 return found
-            if not knows_speed(observed.terms, prior):
+            if uncertain(tracked) is None:
+                is_other = not (is_bent or knows_speed(observed.terms, prior))
+            else:
+                is_other = uncertain(found) is None
+            if is_other:
                 return _with_other(found, tracked)
         return altered(tracked, tracked=True)
 

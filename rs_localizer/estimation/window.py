@@ -267,10 +267,11 @@ class MotionWindow:
     def foreseen(self, time_ns: int, readout_share: float) -> Gaussian:
         """Return the motion that an image at a time after the last frame may have.
 
-        Its accelerations may have grown: what the image tells joins the window without this.
+        Its accelerations may be as large as the settings say, however calm the frames before were:
+        what the image tells joins the window without this.
         """
-        grown = enlarged(self.deviations, self.configured, _GROWN[-1])
-        return self._ahead(time_ns, grown, readout_share, FADING)
+        largest = np.maximum(self.deviations, self.configured)
+        return self._ahead(time_ns, largest, readout_share, FADING)
 
     def _ahead(
         self, time_ns: int, deviations: Array, readout_share: float, lasting: float
