@@ -54,9 +54,10 @@ FAR_OFF = 0.5
 _MOST_POINTS = 200  # of a frame: more points take longer than they are worth
 # Points count within this many inlier thresholds, because the axis may be the wrong one.
 _GATE = 3.0
-# The prior of the velocities in one image, whose points hardly determine them: usual cameras move
-# by some 0.1 rad, or shares of the depth, per readout, at a noise of 0.3 px.
-_OF_USUAL_SPEEDS = 0.3 / 0.1
+# Deviations (rad, or shares of the depth) of the ways of usual cameras in one readout, which the
+# points of one image hardly determine, and of those beside the estimate's, by which points are
+# weighed: with 0.1 errors of a lens (a real board) count as another axis.
+_USUAL_WAY, _BESIDE = 0.1, 0.01
 _LEAST_NOISE, _ROUNDS = 0.1, 4  # px, no real error is smaller; rounds of robust weights
 _OF_NORMAL = 0.455  # median of the squares of a normal distribution
 # Neighbours that are farther away (s) tell little. Between closer ones, unsure stamps hide the way:
@@ -98,8 +99,17 @@ _CROPPED = 0.035
 _SUSPICIOUS, _SHOWN, _CERTAIN, _AT_REST = 4.0, -2.0, 10.0, 20.7
 # So many frames must show another axis: in one, a focal length that is off by 2 % looks like it.
 _SOME = 2
-# What is estimated: T over rows and over columns, their m, and the errors of the last three stamps
-_TIMES, _OTHERWISE, _STAMPS, _ESTIMATED = slice(0, 2), slice(2, 14), slice(14, 17), 17
+# What the filter estimates: T over rows and over columns, their m, and the errors of three stamps.
+_TIMES, _OTHERWISE, _STAMPS, _SIZES = slice(0, 2), slice(2, 14), slice(14, 17), (2, 12, 3)
+_NEWER = np.r_[:14, 15, 16, 14]  # where those of the next stamps are
+_BY_KNOWN = np.eye(12, sum(_SIZES), 2)  # derivatives of ways by m, and places for the others
+# What the points of one frame tell: error of the pose, ways over rows and over columns, and how the
+# rotation changes while rows are read.
+_WAYS, _TOLD = slice(6, 18), 21
+_OVER_COLUMNS, _ROTATIONS = np.r_[:6, 12:18], np.r_[:9, 18:21]
+_OF_USUAL_WAYS, _OF_WAYS_BESIDE = (
+    np.diag(np.repeat([0.0, deviation**-2], [6, 15])) for deviation in (_USUAL_WAY, _BESIDE)
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,22 +134,28 @@ class MeasuredReadout:
 
 
 class _Look(NamedTuple):
-    """A frame whose points are linearized about its estimate."""
+    """The normal equations that the points of a frame give, linearized about its estimate."""
 
     time_ns: int
     found: Estimate
-    units: Array  # (6,) rad and m, of a velocity
-    # (2 n,18) px, derivatives by pose, and by the way over the rows, and over columns; (2 n,3) by
-    # how the rotation changes
-    rows: Array
-    bent: Array
-    off: Array  # (2 n,) px, of the points if the camera did not move
+    units: Array  # (6,) rad and m, of a way
+    information: Array  # (21,21)
+    told: Array  # (21,)
 
-    def over_columns(self) -> Array:
-        """Return the pose's step and velocity (12,) that fit the points if rows are columns."""
-        rows = np.r_[np.delete(self.rows, slice(6, 12), axis=1), _OF_USUAL_SPEEDS * np.eye(12)[6:]]
-        motion = np.linalg.lstsq(rows, np.r_[self.off, np.zeros(6)], rcond=None)[0]
-        return np.asarray(motion * np.tile(self.units, 2), np.float64)
+    def fit(self, unknown: Array, known: Array, usual: bool = False) -> tuple[Array, Array]:
+        """Return some unknowns (k,n), beyond what is ``known`` (k,21), and their covariance.
+
+        ``usual``: ways are those of usual cameras.
+        """
+        information = self.information + usual * _OF_USUAL_WAYS
+        covariance = np.linalg.inv(information[unknown[:, None], unknown])
+        return (self.told - known @ self.information)[:, unknown] @ covariance, covariance
+
+    def of_ways(self) -> tuple[Array, Array]:
+        """Return the information (12,12) of the ways, and that times the ways (12,)."""
+        across = np.linalg.solve(self.information[POSE, POSE], self.information[POSE, _WAYS]).T
+        information = self.information[_WAYS, _WAYS] - across @ self.information[POSE, _WAYS]
+        return information, self.told[_WAYS] - across @ self.told[POSE]
 
 
 class _Way(NamedTuple):
@@ -208,27 +224,31 @@ class ShutterWatch:
         """Readout time that the last seconds of motion show along the set axis; None: none yet."""
         self.fault = self.kind = ""
         """How that contradicts the setting, in one sentence, and in one word."""
-        self.refusal = ""
-        """Why no pose can be told: the shutter moves along the other axis."""
         self.error = 0.0
         """Error (s) of the set readout time, if the motion contradicts it; else 0."""
         self.trusted = True
         """Whether the way from frame to frame tells that within them: not in doubt, nor after one
         before frames show it. To and fro between both, poses jump."""
-        self.is_global = False
-        """Whether all rows are exposed at once."""
-        self._reversed = False  # they may run the other way
-        self._across = False  # or along the other axis
+        self._doubted = ""  # which of both may be the other one, "axis" or "reversed"
         self._looks: deque[_Look] = deque(maxlen=3)
         self._seen: _Look | None = None  # the newest, also if it is too close to be compared
         self._rotations, self._frames = RowRotations(), 0
         # Squared speeds, and squared differences of speeds half an interval before and after
         self._speeds = np.zeros(2)
-        spread = np.repeat([_ANY * self._usual, _LIKE_MOTION, _OF_STAMP], [2, 12, 3])
-        self._any = np.diag(spread**2)
-        self._mean, self._covariance = np.zeros(_ESTIMATED), self._any
+        self._any = np.repeat([_ANY * self._usual, _LIKE_MOTION, _OF_STAMP], _SIZES) ** 2
+        self._mean, self._covariance = np.zeros(sum(_SIZES)), np.diag(self._any)
         self._unlike = 1.0  # by how much the square of what wanders is more than usual
-        self._change, self._jump = np.zeros(6), np.zeros(6)  # of the last way
+        self._change = self._jump = np.zeros(6)  # of the last way
+
+    @property
+    def refusal(self) -> str:
+        """Why no pose can be told: the shutter moves along the other axis."""
+        return self.fault if self.kind == "axis" else ""
+
+    @property
+    def is_global(self) -> bool:
+        """Whether all rows are exposed at once."""
+        return self.kind == "global"
 
     @property
     def rows_turn(self) -> bool:
@@ -252,11 +272,12 @@ class ShutterWatch:
             longer = self.error / self._usual * own
             calibration[VELOCITIES, VELOCITIES] += np.outer(longer, longer)
             found = altered(found, calibration_covariance=calibration)
-        if not (self._reversed or self._across):
+        if not self._doubted:
             return found
         steps, velocities = [np.r_[np.zeros(6), -2.0 * own]], np.r_[np.zeros(6), own]
-        if self._across and self._seen is not None and self._seen.found.rotation is found.rotation:
-            sideways = self._seen.over_columns()
+        if self._doubted == "axis" and self._seen and self._seen.found.rotation is found.rotation:
+            (sideways,), _ = self._seen.fit(_OVER_COLUMNS, np.zeros((1, _TOLD)), True)
+            sideways *= np.tile(self._seen.units, 2)
             steps = [sideways * np.repeat([1.0, sign], 6) - velocities for sign in (1.0, -1.0)]
         joint = found.joint_covariance.copy()
         for step in steps:
@@ -271,7 +292,10 @@ class ShutterWatch:
         ``jumped``: no camera goes there from the last frame. No motion within an image tells of
         such a way.
         """
-        known = self.measured is not None and self.measured.deviation < _WELL_KNOWN * self._usual
+        seen, usual = self.measured, self._usual
+        known = seen is not None and seen.deviation < _WELL_KNOWN * usual
+        if known and seen is not None:  # else it may be another
+            known = seen.odds(usual, seen.readout_time) > _SHOWN
         known &= self.trusted and not self.kind and not self._rotations.is_likely
         self._frames += bool(found)
         may_rest = known and self._frames % _CYCLE >= _ON
@@ -281,15 +305,14 @@ class ShutterWatch:
         if jumped or (self._looks and time_ns <= self._looks[-1].time_ns):
             self._looks.clear()
         is_close = bool(self._looks) and time_ns - self._looks[-1].time_ns < 1e9 * _CLOSEST
-        if is_close and not self._across:
+        if is_close and self._doubted != "axis":
             return
         self._seen = self._look(time_ns, found, sights)
-        if is_close:
+        if is_close or self._seen is None:
             return
         self._looks.append(self._seen)
         # The first of the stamps goes, and the next is as uncertain as any.
-        newer = [*range(_STAMPS.start), *range(_STAMPS.start + 1, _ESTIMATED), _STAMPS.start]
-        self._mean, self._covariance = self._mean[newer], self._covariance[np.ix_(newer, newer)]
+        self._mean, self._covariance = self._mean[_NEWER], self._covariance[_NEWER[:, None], _NEWER]
         self._mean[-1], self._covariance[-1], self._covariance[:, -1] = 0.0, 0.0, 0.0
         self._covariance[-1, -1] = _OF_STAMP**2
         times = [look.time_ns for look in self._looks]
@@ -298,18 +321,19 @@ class ShutterWatch:
         if _vibrates(self._looks[1].found):  # and goes elsewhere there than between its images
             self._rotations = RowRotations()
             return
-        way, now = _Way.through(*self._looks), self._looks[1]
+        way = _Way.through(*self._looks)
         if way is None:
             self._change = self._jump = np.zeros(6)
-        elif len(now.off) >= 2 * now.rows.shape[1]:
+        else:
             jump = way.jump(self._change)
             # Between two images it is in the ways about both.
             widest = max(jump, self._jump, key=np.linalg.norm)
             self._change, self._jump = way.change, jump
-            self._measure(now, way, widest)
+            self._measure(self._looks[1], way, widest)
             self._judge(way.seconds)
 
-    def _look(self, time_ns: int, found: Estimate, sights: FrameSights) -> _Look:
+    def _look(self, time_ns: int, found: Estimate, sights: FrameSights) -> _Look | None:
+        """Return what the points of a frame tell; None if they are too few."""
         seen, own = sights.observations, sights.usable.indices
         if len(own) > _MOST_POINTS:
             some = np.arange(0, len(own), 1 + len(own) // _MOST_POINTS)
@@ -318,17 +342,20 @@ class ShutterWatch:
         state[STATE_ANGULAR_ACCELERATION.start :] = 0.0
         lines = linearized(seen.packed, len(seen), state, np.zeros((len(seen), 6)))
         near = np.linalg.norm(lines.errors, axis=1) < self._gate  # NaN is not
+        if np.count_nonzero(near) < 18:
+            return None
         away = np.linalg.norm(sights.points[own[near]] - found.position, axis=1)
         # Of distances of two sizes a median is now one, now the other: what wanders would jump.
-        units = np.repeat([1.0, 1.0 / float(np.mean(1.0 / away)) if near.any() else 1.0], 3)
+        units = np.repeat([1.0, 1.0 / float(np.mean(1.0 / away))], 3)
         by_pose = lines.by_motion[near, :, POSE] * units
         over_rows = lines.by_motion[near, :, VELOCITIES] * units
         over_columns = self._sideways.row_time(sights.pixels[own[near]])[:, None, None] * by_pose
-        rows = np.concatenate([by_pose, over_rows, over_columns], axis=2).reshape(-1, 18)
-        bent = lines.by_motion[near, :, ANGULAR_ACCELERATION].reshape(-1, 3)
+        bent = lines.by_motion[near, :, ANGULAR_ACCELERATION]
+        rows = np.concatenate([by_pose, over_rows, over_columns, bent], axis=2).reshape(-1, _TOLD)
+        errors = lines.errors[near].ravel()
         speed = np.concatenate([found.angular_velocity, found.linear_velocity]) / units
-        off = rows[:, 6:12] @ speed - lines.errors[near].ravel()
-        return _Look(time_ns, found, units, rows, bent, off)
+        off = rows[:, 6:12] @ speed - errors
+        return _Look(time_ns, found, units, *_robust(rows, off, errors))
 
     def _measure(self, now: _Look, way: _Way, jump: Array) -> None:
         """Add the evidence of a frame; ``jump`` (6,) is the deviation of its speed."""
@@ -337,41 +364,49 @@ class ShutterWatch:
         changes = 0.25 * way.seconds**2 * way.change @ way.change - 12.0 * way.noise
         speeds = way.speed @ way.speed - way.noise
         self._speeds = _MEMORY * self._speeds + [speeds, changes]
-        lasting = np.repeat([math.sqrt(1.0 / _MEMORY), _ALIKE, 1.0], [2, 12, 3])
+        # What was known fades.
         spread = float(self._covariance[_TIMES, _TIMES].diagonal().max())
-        lasting[_TIMES] = np.minimum(lasting[_TIMES], math.sqrt(self._any[0, 0] / spread))
-        known = self._covariance * np.outer(lasting, lasting)
-        wanders = (1.0 - _ALIKE**2) * self._any[_OTHERWISE, _OTHERWISE]
-        known[_OTHERWISE, _OTHERWISE] += self._unlike * wanders
-        prior = self._mean * np.repeat([1.0, _ALIKE, 1.0], [2, 12, 3])
-        mean, self._covariance, speed, weights = _measured(
-            now.rows, now.off, prior, known, way.speed, way.by_stamps, jump
-        )
-        self._mean = mean
-        changed = (mean - prior)[_OTHERWISE] ** 2 / wanders.diagonal()
+        fading = math.sqrt(min(1.0 / _MEMORY, self._any[0] / spread))
+        lasting = np.repeat([fading, _ALIKE, 1.0], _SIZES)
+        known, prior = self._covariance * np.outer(lasting, lasting), self._mean.copy()
+        wanders = (1.0 - _ALIKE**2) * self._any[_OTHERWISE]
+        known[_OTHERWISE, _OTHERWISE] += self._unlike * np.diag(wanders)
+        prior[_OTHERWISE] *= _ALIKE
+        (information, told), mean, by_known = now.of_ways(), prior, _BY_KNOWN.copy()
+        for _ in range(2):
+            speed, jumps = way.speed + mean[_STAMPS] @ way.by_stamps, np.zeros((12, 12))
+            for axis, time in enumerate(mean[_TIMES]):
+                ways = slice(6 * axis, 6 * axis + 6)
+                by_known[ways, axis], by_known[ways, _STAMPS] = speed, time * way.by_stamps.T
+                jumps[ways, ways] = (time**2 + known[axis, axis]) * np.outer(jump, jump)
+            # To the first order about the mean.
+            foreseen = by_known @ prior - by_known[:, _STAMPS] @ mean[_STAMPS]
+            expected = by_known @ known @ by_known.T + jumps
+            gain = known @ by_known.T @ np.linalg.inv(np.eye(12) + information @ expected)
+            mean = prior + gain @ (told - information @ foreseen)
+        left = known - gain @ (information @ (by_known @ known))
+        self._mean, self._covariance = mean, 0.5 * (left + left.T)
+        changed = (self._mean - prior)[_OTHERWISE] ** 2 / wanders
         more = min(float(np.mean(changed)), _MOST_UNLIKELY * self._unlike) - self._unlike
         self._unlike = max(self._unlike + _LEARNING * more, 1.0)
-        self._compare_rotations(now, way, speed, weights, self._unlike * wanders[:3, :3], jump[:3])
+        self._compare_rotations(now, way, speed, jump[:3])
 
-    def _compare_rotations(
-        self, now: _Look, way: _Way, speed: Array, weights: Array, wandering: Array, jump: Array
-    ) -> None:
+    def _compare_rotations(self, now: _Look, way: _Way, speed: Array, jump: Array) -> None:
         """Compare the rotation over the rows of a frame with that between frames."""
-        design = np.concatenate([now.rows[:, :9], now.bent], axis=1)
-        weighed = (design * weights[:, None]).T
-        covariance = np.linalg.inv(weighed @ design)
-        moved = self._usual * (now.rows[:, 6:].reshape(-1, 2, 6) @ speed)
-        turned = (covariance @ (weighed @ (now.off - moved[:, 0])))[6:]
-        turned[3:] -= self._usual**2 * way.change[:3]
-        covariance, by_shutter = covariance[6:, 6:], (covariance @ (weighed @ moved))[6:]
+        moved = np.zeros((3, _TOLD))  # by nothing, over rows, and over columns
+        moved[1, 6:12] = moved[2, 12:18] = self._usual * speed
+        found, covariance = now.fit(_ROTATIONS, moved)
+        still, rows, columns = found[:, 6:].reshape(3, 2, 3)
+        wandering = self._unlike * (1.0 - _ALIKE**2) * _LIKE_MOTION**2
+        wandering += (self._usual * self._shorter) ** 2 * float(speed[:3] @ speed[:3])
         by_stamps = self._usual * way.by_stamps[:, :3]
-        covariance[:3, :3] += by_stamps.T @ self._covariance[_STAMPS, _STAMPS] @ by_stamps
-        shorter = (self._usual * self._shorter) ** 2 * float(speed[:3] @ speed[:3])
-        covariance[:3, :3] += wandering + shorter * np.eye(3)
-        # All of the jump may be within the rows.
-        covariance[:3, :3] += self._usual**2 * np.outer(jump, jump)
-        covariance[3:, 3:] += 12.0 * self._usual**2 * np.outer(jump, jump)
-        one = RowRotation(turned, covariance, by_shutter)
+        jumps = self._usual**2 * np.outer(jump, jump)
+        covariances = np.array([covariance[6:9, 6:9] + jumps, covariance[9:, 9:] + 12.0 * jumps])
+        covariances[0] += by_stamps.T @ self._covariance[_STAMPS, _STAMPS] @ by_stamps
+        covariances[0] += wandering * np.eye(3)
+        by_shutter = np.stack([still - rows, still - columns], axis=2)
+        turned = rows - [np.zeros(3), self._usual**2 * way.change[:3]]
+        one = RowRotation(turned, covariances, by_shutter)
         self._rotations.add(one, 2.0 * self._usual / way.seconds)
 
     @property
@@ -389,7 +424,7 @@ class ShutterWatch:
         ``rate``: rad per readout, of the camera. In the first frames, what looks like a longer
         readout time, or like rotations beside those between images, may be a stabilizer.
         """
-        if self._across:
+        if self._doubted == "axis":
             return 0.0
         rotations, more = self._rotations, float(self._mean[0]) - self._usual
         is_longer = more > _LONGER * math.sqrt(self._covariance[0, 0])
@@ -409,23 +444,14 @@ class ShutterWatch:
         deviation = math.sqrt(spread[axis, axis] - gain * spread[axis, other])
         return MeasuredReadout(value, math.hypot(deviation, _UNSURE * shorter * value))
 
-    def _far(self, over_rows: float, over_columns: float) -> float:
-        """Return half the squared distance of a shutter from what is estimated."""
-        x, y = (self._mean[_TIMES] - (over_rows, over_columns)).tolist()
-        (a, b), (_, c) = self._covariance[_TIMES, _TIMES].tolist()
-        return 0.5 * float(c * x * x - 2.0 * b * x * y + a * y * y) / float(a * c - b * b)
-
     def _judge(self, seconds: float) -> None:
         """Judge what is contradicted; neighbours are so far apart."""
         vibrates = self._unlike >= _SHAKEN or self._rotations.vibrates
-        if vibrates or np.any(np.abs(self._mean[_TIMES]) > 0.55 * seconds):
-            if self.kind in ("", "stabilized"):
-                self.trusted, self._reversed, self._across = True, False, False
-        elif not self._judge_axis():
-            self._judge_time()
-        if self.refusal:
-            return
-        if self._rotations.is_certain:
+        if not vibrates and np.all(np.abs(self._mean[_TIMES]) < 0.55 * seconds):
+            self._judge_shutter()
+        elif self.kind in ("", "stabilized"):
+            self.trusted, self._doubted = True, ""
+        if self._rotations.is_certain and self.kind != "axis":
             self.kind, self.error = "stabilized", 0.0
             turned = math.degrees(self._turned())
             self.fault = (
@@ -436,45 +462,40 @@ class ShutterWatch:
         elif self.kind == "stabilized":
             self.kind = self.fault = ""
 
-    def _judge_axis(self) -> bool:
-        """Return whether the other axis is likely, and refuse poses if it is certain."""
-        across = self._along(1)
+    def _judge_shutter(self) -> None:
+        """Judge whether axis, direction or readout time are contradicted."""
         far = self._mean[_TIMES] ** 2 / self._covariance[_TIMES, _TIMES].diagonal()
         odds = 0.5 * float(far[1] - far[0])  # of the other axis; a global shutter has both
-        sideways = self._far(0.0, math.copysign(self._usual, across.readout_time))
-        doubtful = self._far(self._usual, 0.0) - sideways > _SUSPICIOUS
-        doubtful &= self._far(0.0, 0.0) - sideways > -_SUSPICIOUS
-        self.refusal, self._across = "", doubtful or odds > _SUSPICIOUS
-        is_certain = odds > _CERTAIN and len(self._rotations) >= _SOME
-        if is_certain or (self.kind == "axis" and odds > 0.0):
-            direction = ACROSS[self._direction]
-            direction = direction if across.readout_time > 0.0 else REVERSED[direction]
-            self.kind = "axis"
-            self.fault = self.refusal = (
-                f"the image shows a shutter that moves {direction} in {across}, not "
-                f"{self._direction}; no poses are published until scan_direction is {direction}"
-            )
-        self.trusted &= not (self.refusal or self._across)
-        return bool(self.refusal) or self._across
-
-    def _judge_time(self) -> None:
-        """Judge whether readout time or direction are contradicted."""
+        if odds > _SUSPICIOUS or (self.kind == "axis" and odds > 0.0):
+            self.trusted, self._doubted = False, "axis"
+            if self.kind == "axis" or (odds > _CERTAIN and len(self._rotations) >= _SOME):
+                self.kind, self.fault = "axis", self._fault_of_axis()
+            return
         measured, usual = self._along(0), self._usual
-        self.measured = measured if measured.deviation < usual else None
-        self.kind, self.fault = self._contradiction(measured)
-        found, self.is_global = measured.readout_time, self.kind == "global"
+        found, self.measured = measured.readout_time, None
+        if measured.deviation < usual:
+            self.measured = measured
+        self.kind, self.fault = self._fault_of_time(measured)
         shorter = usual / max(abs(found), _GLOBAL * usual, measured.deviation)
         off = math.hypot(found - usual, measured.deviation)
         self.error = off * max(shorter, 1.0) if self.kind else 0.0
         of_global, of_reversed = (measured.odds(value, usual) for value in (0.0, -usual))
-        self._reversed = self.kind == "reversed" or of_reversed > _SUSPICIOUS
-        doubt = max(of_global, of_reversed)
+        is_reversed = self.kind == "reversed" or of_reversed > _SUSPICIOUS
+        self._doubted, doubt = "reversed" if is_reversed else "", max(of_global, of_reversed)
         if (self.kind and found < FAR_OFF * usual) or doubt > _SUSPICIOUS:
             self.trusted = False
         elif doubt < _SHOWN:
             self.trusted = True
 
-    def _contradiction(self, measured: MeasuredReadout) -> tuple[str, str]:
+    def _fault_of_axis(self) -> str:
+        across, direction = self._along(1), ACROSS[self._direction]
+        direction = direction if across.readout_time > 0.0 else REVERSED[direction]
+        return (
+            f"the image shows a shutter that moves {direction} in {across}, not "
+            f"{self._direction}; no poses are published until scan_direction is {direction}"
+        )
+
+    def _fault_of_time(self, measured: MeasuredReadout) -> tuple[str, str]:
         """Return the kind of the fault of the set readout time, and a sentence; empty: none."""
         found, usual, direction = measured.readout_time, self._usual, self._direction
         if not measured.contradicts(usual):
@@ -487,59 +508,36 @@ class ShutterWatch:
         # One of both; or vibration or a stop, which may look like it.
         if found < -_GLOBAL * usual or not (self.kind or self._rotations.are_enough):
             return "", ""
-        is_global = found < _GLOBAL * usual
-        named = " (a global shutter)" if is_global else ""
-        return "global" if is_global else "duration", (
+        kind, named = "duration", ""
+        if found < _GLOBAL * usual:
+            kind, named = "global", " (a global shutter)"
+        return kind, (
             f"estimated readout time {measured}{named} differs from readout_time = "
             f"{1e3 * usual:g} ms"
         )
 
 
 @entry
-def _measured(
-    rows: Array2, off: Array1, prior: Array1, known: Array2, speed: Array1, by_stamps: Array2,
-    jump: Array1,
-) -> tuple[Array, Array, Array, Array]:  # fmt: skip
-    """Return what is estimated (17,) after a frame, its covariance, speed and weights.
+def _robust(rows: Array2, off: Array1, errors: Array1) -> tuple[Array, Array]:
+    """Return information (21,21) and that times the numbers (21,) by which points are off.
 
     Args:
-        rows: (2 n,18) px, and errors (2 n,): of :class:`_Look`.
-        prior: (17,) and its covariance, likewise.
-        speed, by_stamps, jump: (6,), its derivatives (3,6) and deviation (6,), of :class:`_Way`.
+        rows: (2 n,21) px by the numbers.
+        off: (2 n,) px.
+        errors: (2 n,) px, with the estimate of the frame.
     """
-    mean, fitted, information = prior, np.zeros(18), np.zeros((18, 18))
-    along, moved, variance = rows[:, 6:].copy(), np.zeros((12, _ESTIMATED)), 0.0
-    moved[:, _OTHERWISE] = np.eye(12)  # way over rows, and over columns, by all that
+    left, information, weighed, weights = errors, _OF_WAYS_BESIDE, rows, np.ones(len(rows))
+    variance = np.median(errors**2) / _OF_NORMAL
     for k in range(_ROUNDS):
-        own, ways = speed + mean[_STAMPS] @ by_stamps, prior[_OTHERWISE].copy()
-        for axis in range(2):
-            of_axis = slice(6 * axis, 6 * axis + 6)
-            moved[of_axis, axis], moved[of_axis, _STAMPS] = own, mean[axis] * by_stamps.T
-            ways[of_axis] += prior[axis] * own + mean[axis] * (
-                (prior[_STAMPS] - mean[_STAMPS]) @ by_stamps
-            )
-        expected = moved @ known @ moved.T
-        for axis in range(2):
-            of_axis = slice(6 * axis, 6 * axis + 6)
-            expected[of_axis, of_axis] += mean[axis] ** 2 * np.outer(jump, jump)
-        information[6:, 6:] = np.linalg.inv(expected)
-        rest = off - along @ ways
-        left = off - rows @ fitted if k > 0 else rest
-        if k == 0:
-            ordered, middle = np.sort(left**2), len(left) // 2
-            variance = 0.5 * (ordered[middle - 1] + ordered[middle]) / _OF_NORMAL
-        variance = max(variance, _LEAST_NOISE**2)
-        weights = 1.0 / (variance + left**2 / 9.0)
+        if k > 0:
+            known = information + _OF_WAYS_BESIDE
+            left = errors - rows @ np.linalg.solve(known, errors @ weighed)
+            variance = np.sum(weights * left**2) / np.sum(weights)
+            variance *= len(left) / (len(left) - _TOLD)
+        weights = 1.0 / (max(variance, _LEAST_NOISE**2) + left**2 / 9.0)
         weighed = rows * weights.reshape(-1, 1)
-        covariance = np.linalg.inv(weighed.T @ rows + information)
-        step = covariance @ (rest @ weighed)
-        fitted = step.copy()
-        fitted[6:] += ways
-        variance = np.sum(weights * (off - rows @ fitted) ** 2) / np.sum(weights)
-        gain = known @ moved.T @ information[6:, 6:].copy()
-        mean = prior + gain @ step[6:]
-    taken = expected - covariance[6:, 6:]
-    return mean, known - gain @ taken @ gain.T, own, weights
+        information = weighed.T @ rows
+    return information, off @ weighed
 
 
 def _vibrates(found: Estimate) -> bool:

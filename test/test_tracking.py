@@ -537,12 +537,13 @@ def test_a_head_that_turns_at_once_tells_no_other_shutter():
         )
         return first * second, np.zeros((len(since), 3))
 
-    points = np.random.default_rng(0).uniform(-5.0, 5.0, (1500, 3))
+    points = np.random.default_rng(1).uniform(-5.0, 5.0, (1500, 3))
     tracker, moving = tracker_of(), Moving(turning)
     for k, t in enumerate(times(66)):
-        found = tracker.localize(10**9 + round(1e9 * t), *moving.frame(t, points, 150, 0.5, seed=k))
+        seen = moving.frame(t, points, 150, 0.5, seed=100 + k)
+        found = tracker.localize(10**9 + round(1e9 * t), *seen)
         assert found, str(found)
-    assert not tracker.shutter.measured.contradicts(READOUT)
+    assert tracker.shutter.measured.readout_time == pytest.approx(READOUT, rel=0.06)
 
 
 def jolted(seed: int, degrees: float) -> Moving:

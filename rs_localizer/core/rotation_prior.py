@@ -112,6 +112,16 @@ def parts_of(rotations: Array) -> tuple[Array, Array, Array]:
 
 
 @entry
+def after(turns: Array2) -> Array:
+    """Return rotations (n+1,3,3) camera_then_from_camera_first, by turns (n,3) of the camera."""
+    rotations = np.empty((len(turns) + 1, 3, 3))
+    rotations[0] = np.eye(3)
+    for i in range(len(turns)):
+        rotations[i + 1] = so3.exp(-turns[i]) @ rotations[i]
+    return rotations
+
+
+@entry
 def _parts_of(rotations: Array3) -> Array:
     parts, off = np.zeros((2 + FUNCTIONS, 3)), np.empty((len(rotations), 3))
     for _ in range(3):  # Gauss-Newton; rotations are small

@@ -12,14 +12,11 @@ vibration of ``f`` Hz has a rate of ``2 pi f`` times its angle, and a curvature 
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, Array2, Array3
-from rs_localizer.estimation.robust import eliminate
-from rs_localizer.native import entry, kernel
+from rs_localizer.core.arrays import Array
 
 # Frames that are compared, and least number of them.
 _LAST, _LEAST = 30, 8
@@ -32,18 +29,71 @@ _LEAST_TOLD = 1e-9
 
 
 class RowRotation(NamedTuple):
-    """The rotation over the rows of a frame, beside the motion between frames."""
+    """The rotation over the rows of a frame, beside the motion between frames, and its change."""
 
-    turned: Array  # (6,) rotation, rad per readout, and how it changes, rad per readout squared
-    covariance: Array  # (6,6)
-    by_shutter: Array  # (6,2) of it, if rows, or columns, take as long as is set
+    turned: Array  # (2,3) rad per readout, and rad per readout squared
+    covariances: Array  # (2,3,3)
+    by_shutter: Array  # (2,3,2) of it, if rows, or columns, take as long as is set
+
+
+class _Whitened(NamedTuple):
+    """Rotations of n frames and their changes, and what a mean and another shutter make them."""
+
+    turned: Array  # (n,2,3)
+    design: Array  # (n,2,3,5) derivatives by the mean, and by what another shutter adds
+    whiten: Array  # (n,2,3,3)
+    rows: Array  # (n,2,3,5) the whitened design
+    variances: Array  # (n,2,3)
+
+    def and_of(self, one: RowRotation) -> _Whitened:
+        """Return the last ones, and one more."""
+        design = np.concatenate([np.broadcast_to(np.eye(3), (2, 3, 3)), one.by_shutter], axis=2)
+        variances, axes = np.linalg.eigh(one.covariances)
+        whiten = axes.swapaxes(1, 2) / np.sqrt(variances)[:, :, None]
+        whiten[0] = axes[0] @ whiten[0]  # neighbours are compared along the same axes
+        more = one.turned, design, whiten, whiten @ design, variances
+        return _Whitened(*(
+            np.concatenate([last[1 - _LAST :], each[None]])
+            for last, each in zip(self, more, strict=True)
+        ))  # fmt: skip
+
+    def varying(self, values: Array, k: int) -> tuple[Array, Array]:
+        """Return values (n,3) without their mean and what another shutter adds, also whitened.
+
+        ``k``: 0 for rotations, 1 for changes.
+        """
+        rows, whitened = self.rows[:, k].reshape(-1, 5), self.whitened(values, k)
+        normal = rows.T @ rows
+        normal += _LEAST_TOLD * normal.trace() * np.eye(5)
+        found = np.linalg.solve(normal, rows.T @ whitened.ravel())
+        return values - self.design[:, k] @ found, whitened - self.rows[:, k] @ found
+
+    def whitened(self, values: Array, k: int) -> Array:
+        """Return values (n,3) of unit variance."""
+        return (self.whiten[:, k] @ values[:, :, None])[:, :, 0]
+
+    def likeness(self, values: Array, whitened: Array) -> tuple[float, float]:
+        """Return how alike neighbours of rotations (n,3) are, in deviations, and their rms.
+
+        Independent errors of neighbours leave their product as it is. In the rms products count by
+        what is known of them: where a motion starts or stops, little is.
+        """
+        pairs = float(np.sum(whitened[1:] * whitened[:-1]))
+        known = np.sqrt(np.sum(1.0 / self.variances[:, 0], axis=1))
+        known = known[1:] * known[:-1]
+        square = float(known @ np.sum(values[1:] * values[:-1], axis=1))
+        square /= max(float(known.sum()), 1e-300)
+        return pairs / math.sqrt(3.0 * len(values)), math.sqrt(max(square, 0.0))
+
+
+_NONE = _Whitened(*(np.zeros((0, 2, 3, *more)) for more in ((), (5,), (3,), (5,), ())))
 
 
 class RowRotations:
     """The rotations of the last frames beside those between images, compared."""
 
     def __init__(self) -> None:
-        self._last: deque[RowRotation] = deque(maxlen=_LAST)
+        self._last = _NONE
         self._smooth = self._bent = 0.0
         self.rate = 0.0
         """Rate (rad per readout, rms) at which images are turned as wholes, or vibrate."""
@@ -56,10 +106,10 @@ class RowRotations:
     @property
     def are_enough(self) -> bool:
         """Whether vibration near the rate of the images would show."""
-        return len(self._last) >= _LEAST
+        return len(self._last.turned) >= _LEAST
 
     def __len__(self) -> int:
-        return len(self._last)
+        return len(self._last.turned)
 
     @property
     def is_likely(self) -> bool:
@@ -78,87 +128,18 @@ class RowRotations:
 
     def add(self, one: RowRotation, readouts: float) -> None:
         """Take the rotation of the next frame, ``readouts`` times readouts per interval later."""
-        self._last.append(one)
-        turned, covariances, by_shutter = map(np.array, zip(*self._last, strict=True))
-        weights = np.linalg.inv(covariances[:, :3, :3]), np.linalg.inv(covariances[:, 3:, 3:])
-        smooth, rate = _likeness(turned[:, :3].copy(), weights[0])
+        every = self._last = self._last.and_of(one)
+        rates, bends = every.turned[:, 0], every.turned[:, 1]
+        smooth, rate = every.likeness(rates, every.whitened(rates, 0))
         self.most = rate if smooth > _LIKELY else 0.0
         if not self.are_enough:
             return
-        self._smooth, self.rate, self._bent = _compared(
-            turned, weights, covariances, by_shutter, readouts
-        )
+        rates, whitened = every.varying(rates, 0)
+        self._smooth, self.rate = every.likeness(rates, whitened)
+        steps = readouts * (rates[1:] - rates[:-1])
+        turning = np.concatenate([steps[:1], 0.5 * (steps[1:] + steps[:-1]), steps[-1:]])
+        _, bent = every.varying(bends - turning, 1)
+        more = (math.pi * readouts * self.rate) ** 2 / 3.0 / every.variances[:, 1]
+        self._bent = 0.5 * float(np.sum(bent**2 * more / (1.0 + more) - np.log1p(more)))
         is_new = self.are_smooth and self._bent < -_LIKELY
         self.is_certain = is_new or (self.is_certain and self._smooth > _LIKELY)
-
-
-@entry
-def _compared(
-    turned: Array2, weights: tuple[Array3, Array3], covariances: Array3, by_shutter: Array3,
-    readouts: float,
-) -> tuple[float, float, float]:  # fmt: skip
-    """Return likeness and rms of rotations (n,6) but for a shutter's, and odds of vibration."""
-    count = len(turned)
-    rates = _varying(turned[:, :3].copy(), weights[0], by_shutter)
-    smooth, rate = _likeness(rates, weights[0])
-    of_stabilizer = np.empty((count, 3))
-    for i in range(count):
-        before, after = max(i - 1, 0), min(i + 1, count - 1)
-        of_stabilizer[i] = (rates[after] - rates[before]) * (readouts / (after - before))
-    bends = _varying(turned[:, 3:] - of_stabilizer, weights[1], by_shutter[:, 3:].copy())
-    vibrating = (math.pi * readouts * rate) ** 2 / 3.0
-    return smooth, rate, _density(bends, covariances, vibrating) - _density(bends, covariances, 0.0)
-
-
-@entry
-def _likeness(values: Array2, weights: Array3) -> tuple[float, float]:
-    """Return how alike neighbours of values (n,3) are, in deviations, and their rms.
-
-    Independent errors of neighbours leave their product as it is. In the rms products count by
-    what is known of them: where a motion starts or stops, little is.
-    """
-    pairs, square, total, before, known_before = 0.0, 0.0, 0.0, np.zeros(3), 0.0
-    for i in range(len(values)):
-        factor = weights[i].copy()
-        known = math.sqrt(np.trace(factor))
-        eliminate(factor, 3)
-        whitened = np.triu(factor) @ values[i]
-        pairs += np.sum(whitened * before)
-        if i > 0:
-            square += known * known_before * np.sum(values[i] * values[i - 1])
-            total += known * known_before
-        before, known_before = whitened, known
-    square /= max(total, 1e-300)
-    return pairs / math.sqrt(3.0 * len(values)), math.sqrt(max(square, 0.0))
-
-
-@kernel
-def _varying(values: Array, weights: Array, by_shutter: Array) -> Array:
-    """Return values (n,3) without their mean, and without what another shutter adds."""
-    normal, right, design = np.zeros((5, 5)), np.zeros(5), np.eye(3, 5)
-    for i in range(len(values)):
-        design[:, 3:] = by_shutter[i, :3]
-        weighed = design.T @ weights[i]
-        normal, right = normal + weighed @ design, right + weighed @ values[i]
-    told, axes = np.linalg.eigh(normal)
-    least = _LEAST_TOLD * told[4]
-    found = axes @ ((right @ axes) * np.where(told > least, 1.0 / np.maximum(told, least), 0.0))
-    rest: Array = values - found[:3]
-    for i in range(len(values)):
-        rest[i] -= by_shutter[i, :3].copy() @ found[3:]
-    return rest
-
-
-@kernel
-def _density(values: Array, covariances: Array, more: float) -> float:
-    """Return the logarithm of the density of values (n,3) but for a constant; each variance has
-    ``more``.
-    """
-    total, equations = 0.0, np.empty((3, 4))
-    for i in range(len(values)):
-        equations[:, :3] = covariances[i, 3:, 3:] + more * np.eye(3)
-        equations[:, 3] = values[i]
-        eliminate(equations, 3)
-        for k in range(3):
-            total -= 0.5 * equations[k, 3] ** 2 + math.log(equations[k, k])
-    return total

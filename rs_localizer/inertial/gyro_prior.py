@@ -26,7 +26,6 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.rate_spline import rotations_at_knots, spline
 from rs_localizer.core.reasons import ImuReason, Unused
 from rs_localizer.core.rotation_prior import ROTATION, WHOLE, RotationPrior
 from rs_localizer.core.shutter import Motion, carried, motion_of, numbers_of
@@ -59,6 +58,7 @@ from rs_localizer.inertial.turning import (
     GyroscopeErrors,
     Read,
     read,
+    turned,
 )
 from rs_localizer.inertial.turning import PARAMETERS as ERRORS
 
@@ -389,9 +389,11 @@ def gravity_seen(
     times = np.asarray(1e-9 * (samples.times_ns[chosen] - now_ns), np.float64)
     if len(times) < 2 or not (times[0] < -_SHORTEST and times[-1] >= 0.0):
         return None
-    cubics = spline(times, samples.angular_velocity[chosen] - errors.bias)
-    rotations = rotations_at_knots(times, cubics)
-    forces = np.einsum("nji,nj->ni", rotations, samples.specific_force[chosen])
+    rates = samples.angular_velocity[chosen] - errors.bias
+    turns = turned(times, np.concatenate([rates, 0.5 * (rates[1:] + rates[:-1])]))
+    # In the axes of the reading that is nearest to now.
+    forces = np.einsum("nji,nj->ni", turns, samples.specific_force[chosen])
+    forces = forces @ turns[np.abs(times).argmin()].T
     force = forces.mean(axis=0)
     length = float(np.linalg.norm(force))
     scatter = math.sqrt(float(np.mean(np.var(forces, axis=0))))

@@ -11,9 +11,8 @@ The rotation is a mean and a covariance of numbers that are linear in the rates.
 sampled, because a vibration is not linear in them: its mean square is then in the covariance.
 
 The rates between samples, and their covariance, are those of a Gaussian process (Wiener, 1949). Its
-spectrum and the noise are read from some tenths of a second of samples. Rates are taken at the
-samples and half way between them. There a cubic spline through the samples would lose 4 % of a
-vibration at 0.3 of the sample rate; for what lies between those, cubics are good enough.
+spectrum and the noise are read from some tenths of a second of samples. They are a sum of waves, a
+constant and a slope, so that a delay shifts the waves' phases.
 """
 
 from __future__ import annotations
@@ -21,14 +20,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.rate_spline import rotations_at_knots, spline, turns_at
-from rs_localizer.core.rotation_prior import NODES, parts_of
+from rs_localizer.core.rotation_prior import NODES, after, parts_of
 from rs_localizer.core.shake import COMBINATIONS, MIDDLE_RATES, RESOLVED, shake_functions
 from rs_localizer.inertial.samples import MARGIN, ImuSamples
 
@@ -69,6 +67,9 @@ _VAGUE, _STEEPER = 100.0, 4.0
 _LEAST = 1e-9
 
 
+Waves = np.ndarray[Any, np.dtype[np.complex128]]
+
+
 class Spectrum(NamedTuple):
     """The rates of a camera by frequency, and the noise of readings, as they tell both."""
 
@@ -93,14 +94,14 @@ def spectrum_of(times_ns: IntArray, rates: Array, noise: float) -> Spectrum:
     period = 1e-9 * float(times_ns[-1] - times_ns[0]) / (len(times_ns) - 1)
     length = min(max(round(_ALIKE / period), _FEWEST), _MOST, len(rates))
     starts = np.arange(len(rates) - length, -1, -max(length // 2, 1))
-    pieces = rates[starts[:, None] + np.arange(length)]
+    pieces = rates.T[:, starts[:, None] + np.arange(length)]
     line, taper = _piece(length)
-    lines = line.T @ pieces
-    pieces = (pieces - line @ lines) * taper[:, None]
-    shown = np.abs(np.fft.rfft(pieces, 2 * length, axis=1)) ** 2
-    power = shown.mean(axis=(0, 2)) / (taper @ taper)  # of white noise: its variance
+    lines = pieces @ line
+    shown = np.fft.rfft((pieces - lines @ line.T) * taper, 2 * length).view(float)
+    power = np.einsum("apf,apf->f", shown, shown).reshape(-1, 2).sum(axis=1)
+    power /= 3.0 * len(starts) * (taper @ taper)  # of white noise: its variance
     # Deviations over means: of a frequency, and of a band.
-    doubt = 1.0 / math.sqrt(3 * len(pieces))
+    doubt = 1.0 / math.sqrt(3 * len(starts))
     band, square = max(length // _BANDS, 1), float(np.mean(rates**2))
     quick = power[min(_SLOW, length // 2) :]
     least = float(np.convolve(quick, np.full(band, 1.0 / band), "valid").min())
@@ -110,7 +111,7 @@ def spectrum_of(times_ns: IntArray, rates: Array, noise: float) -> Spectrum:
     own = 0.5 * (beside + np.hypot(beside, doubt * variance)) / length
     own[[0, -1]] *= 0.5
     cycles = np.arange(length + 1) / (2 * length * period)
-    slope = max(float(np.mean(lines[:, 0] ** 2)) - variance, doubt * variance)
+    slope = max(float(np.mean(lines[..., 0] ** 2)) - variance, doubt * variance)
     slope *= _STEEPER * 12.0 / (length**3 * period**2)
     constant = _VAGUE * (square + variance)
     return Spectrum(2.0 * np.pi * cycles, own, variance, constant, slope)
@@ -123,27 +124,46 @@ def _piece(length: int) -> tuple[Array, Array]:
     return line, np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
 
 
-def smoothed(
-    times: Array, rates: Array, wanted: Array, rows: Array, spectrum: Spectrum
-) -> tuple[Array, Array]:
-    """Return the rates (w,3) at wanted times by readings (n,3), and a covariance (r,r) of an axis.
+def waves_at(times: Array, spectrum: Spectrum) -> Waves:
+    """Return the waves of a spectrum, a constant and a slope at times (n,): (n,f+1)."""
+    waves = np.ones((len(spectrum.frequencies) + 1, len(times)), np.complex128)
+    turning, waves[-1] = np.exp(1j * spectrum.frequencies[1] * times), times
+    for k in range(len(waves) - 2):  # twice as fast as a cumulative product
+        np.multiply(waves[k - 1] if k else 1.0, turning, out=waves[k])
+    return waves.T
+
+
+def smoothed(own: Waves, rates: Array, rows: Waves, spectrum: Spectrum) -> tuple[Waves, Array]:
+    """Return factors (f+1,3) of the waves by readings (n,3), and a covariance (r,r) of an axis.
+
+    The real parts of products of waves and factors are rates.
 
     Args:
-        times: (n,) of the readings, s.
-        wanted: (w,) s.
-        rows: (r,) s, of the covariance.
+        own: (n,f+1) the waves at the readings.
+        rows: (r,f+1) those of the covariance.
     """
-    every = np.concatenate([times, wanted, rows])
-    turning = np.exp(1j * spectrum.frequencies[1] * every)[:, None]
-    waves = np.cumprod(np.repeat(turning, len(spectrum.frequencies) - 1, axis=1), axis=1)
-    waves *= np.sqrt(spectrum.variances[1:])
-    ones = np.full(len(every), math.sqrt(spectrum.constant + spectrum.variances[0]))
-    shown = np.column_stack([waves.real, waves.imag, ones, math.sqrt(spectrum.slope) * every])
-    own, other, last = np.split(shown, [len(times), len(times) + len(wanted)])
-    known = own @ own.T + spectrum.noise * np.eye(len(times))
-    told = np.linalg.solve(known, np.hstack([rates, own @ last.T]))
-    left = last @ last.T - (last @ own.T) @ told[:, 3:]
-    return other @ (own.T @ told[:, :3]), left
+    _, variances, noise, constant, slope = spectrum
+    sizes = np.sqrt(np.concatenate([variances[1:], [constant + variances[0], slope]]))
+    shown, last = (np.multiply(each, sizes, order="C").view(float) for each in (own, rows))
+    known, crossed = shown @ shown.T, shown @ last.T
+    known.flat[:: len(own) + 1] += noise
+    told = np.linalg.solve(known, np.concatenate([rates, crossed], axis=1))
+    left = last @ last.T - crossed.T @ told[:, 3:]
+    parts = (shown.T @ told[:, :3]).reshape(-1, 2, 3)
+    return sizes[:, None] * (parts[:, 0] - 1j * parts[:, 1]), left
+
+
+def turned(path: Array, rates: Array) -> Array:
+    """Return rotations (n,3,3) camera_then_from_camera_first at moments (n,) of a path, s.
+
+    Args:
+        rates: (2 n - 1,3) rad/s, at these and half way between.
+    """
+    ends, middles = rates[: len(path)], rates[len(path) :]
+    # By Simpson's rule; axes that change within a step turn the camera by some 1e-6 rad.
+    steps = (ends[:-1] + 4.0 * middles + ends[1:]) * ((path[1:] - path[:-1])[:, None] / 6.0)
+    rotations: Array = after(steps)
+    return rotations
 
 
 def _parts_by_rates() -> Array:
@@ -157,6 +177,7 @@ def _parts_by_rates() -> Array:
 
 
 _PARTS = _parts_by_rates()
+_OF_CONSTANT = _PARTS.sum(axis=1)[:, None, None]  # of a constant rate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -241,56 +262,58 @@ def read(
         if end - begin < len(spectrum.frequencies):
             break
     near = slice(max(min(begin, end - len(spectrum.frequencies)), 0), end)
-    finer = np.empty(2 * len(times[near]) - 1)
-    finer[::2], finer[1::2] = times[near], 0.5 * (times[near][1:] + times[near][:-1])
-    grid = readout_time * _TAU
-    smooth, spread = smoothed(times[near], found[near], finer, grid, spectrum)
-    dense, found = (
-        np.concatenate([of[: near.start], within, of[near.stop :]])
-        for of, within in zip((times, found), (finer, smooth), strict=True)
-    )
     delays, weights = _delays(deviation, period)
+    # From the last frame to the first row, and on to the last one.
+    nodes, count = readout_time * NODES, math.ceil(abs(length) / period)
+    way = np.arange(count) * ((nodes[0] + length) / max(count, 1)) - length
+    path = np.concatenate([way, nodes])
+    moments = np.concatenate([path, 0.5 * (path[1:] + path[:-1]), [0.0, -length]])
+    grid, first = readout_time * _TAU, len(delays) + len(times[near])
+    shown = waves_at(np.concatenate([delays, times[near], grid, moments]), spectrum)
+    along = shown[first + len(grid) :]
+    rows = _PARTS @ shown[first : first + len(grid)]
+    told, spread = smoothed(shown[len(delays) : first], found[near], rows, spectrum)
     # All that follows is by readings that are so much later.
-    cubics = spline(dense, found)
-    knots = rotations_at_knots(dense, cubics)
-    moments = np.append(grid, [0.0, -length]) + delays[:, None]
-    _, rates = turns_at(np.clip(moments, dense[0], dense[-1]).ravel(), dense, cubics, knots)
-    rates = readout_time * rates.reshape(*moments.shape, 3)
-    slopes, rates = (rates[:, -2] - rates[:, -1]) / readout_time, rates[:, :-2]
-    late = (_PARTS @ rates).reshape(len(delays), -1)
+    later = shown[: len(delays), :, None] * told
+    later[:, -2] += later[:, -1]
+    later[:, -1] = told[-1]
+    late = readout_time * (rows @ later).real.reshape(len(delays), -1)
+    ends = (along[-2:] @ later).real
+    usual = (along[:-2] @ (weights @ later.reshape(len(delays), -1)).reshape(-1, 3)).real
+    far = (moments < times[near][0]) & (near.start > 0)
+    far |= (moments > times[near][-1]) & (end < len(times))
+    if far.any():
+        usual[far[:-2]] = _at(moments[:-2][far[:-2]], times, found)
+        ends[:, far[-2:]] = _at(moments[-2:][far[-2:]] + delays[:, None], times, found)
+    slopes = ends[:, 0] - ends[:, 1]
     # From the last frame to this one, beside a constant.
-    steps = 0.5 * (slopes[1:] + slopes[:-1]) * np.diff(delays)[:, None]
-    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    every = np.hstack([turned, late])
+    steps = 0.5 * (slopes[1:] + slopes[:-1]) * (delays[1:] - delays[:-1])[:, None]
+    every = np.concatenate([np.zeros((len(delays), 3)), late], axis=1)
+    every[1:, BETWEEN] = np.cumsum(steps, axis=0)
     mean = weights @ every
     off, by_errors = every - mean, np.zeros((every.shape[1], PARAMETERS))
     by_errors[:, DELAY] = -((weights * delays) @ off)[:, None] / (weights @ delays**2)
     off += np.outer(delays, by_errors[:, DELAY.start])
     rest = (off.T * weights) @ off
-    if len(delays) > 3:
-        found = np.einsum("d,dtx->tx", weights, _at(dense + delays[:, None], dense, found))
-        cubics = spline(dense, found)
-        knots = rotations_at_knots(dense, cubics)
-    turns, _ = turns_at(np.append(readout_time * NODES, -length), dense, cubics, knots)
-    usual = (weights @ rates.reshape(len(delays), -1)).reshape(-1, 3)
-    within = readout_time * errors.derivatives(usual / readout_time)
-    by_errors[WITHIN] += (_PARTS @ within.reshape(len(usual), -1)).reshape(-1, PARAMETERS)
-    spread = _PARTS @ (readout_time**2 * spread) @ _PARTS.T
+    within = errors.derivatives(mean[WITHIN].reshape(-1, 3))
+    within[..., BIAS] *= readout_time * _OF_CONSTANT
+    by_errors[WITHIN] += within.reshape(-1, PARAMETERS)
+    spread *= readout_time**2
     for axis in range(3):
         rest[WITHIN, WITHIN][axis::3, axis::3] += spread
-    between = None
+    turns = turned(path, usual)
+    turns = turns @ turns[len(path) - 1 - len(NODES) // 2].T
     if length != 0.0:
-        between = np.ascontiguousarray(turns[-1].T)
-        angle = so3.log(np.ascontiguousarray(turns[-1]))
+        angle = so3.log(np.ascontiguousarray(turns[0]))
         # A constant rate in the camera's axes of each moment, seen in those of then.
         by_rate = length * so3.right_jacobian(angle)
         by_errors[BETWEEN] += by_rate @ errors.derivatives(angle / length)[0]
         mean[BETWEEN] = angle
         rest[BETWEEN, BETWEEN] += spectrum.noise * period * abs(length) * np.eye(3)
     squares = np.square(mean).reshape(-1, 3).sum(axis=1)
-    rest[np.diag_indices(len(rest))] += _SKEW**2 * np.repeat(squares, 3)
+    rest.flat[:: len(rest) + 1] += _SKEW**2 * np.repeat(squares, 3)
     rest += _JITTER**2 * np.outer(by_errors[:, DELAY.start], by_errors[:, DELAY.start])
-    return Read(*parts_of(turns[:-1]), between, by_errors, rest)
+    return Read(*parts_of(turns[-len(NODES) :]), turns[0].T if length else None, by_errors, rest)
 
 
 def _delays(deviation: float, period: float) -> tuple[Array, Array]:

@@ -386,7 +386,7 @@ def test_a_frame_is_widened_by_what_it_shows_itself_of_the_other_axis():
     clouds = [read_correspondences(message) for message, _ in seen]
     for given in (clouds, clouds[1:]):
         watch = ShutterWatch(CAMERA, 2.0)
-        watch._across = True  # likely, by the frames before
+        watch._doubted = "axis"  # likely, by the frames before
         for cloud in given:
             found = localizer.localize(cloud.points, cloud.pixels)
             watch.add(cloud.stamp_ns, found, localizer.sights(cloud.points, cloud.pixels))
