@@ -316,7 +316,7 @@ def record_features(
     extraction = Extraction()
     kept = _kept(shots, bag, extraction)
     for shot, image, _ in usable(kept, options.scan_direction, extraction, done):
-        extracted = extractor.extract(image)
+        extracted = extractor.detect(image)
         if len(extracted.features):
             extraction.counts.append(len(extracted.features))
             _write(bag, shot, KEYPOINTS_TOPIC, keypoints(extracted, make_message), options)
