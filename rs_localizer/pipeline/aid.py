@@ -116,7 +116,7 @@ class AidInput:
 
     @property
     def mostly(self) -> Unused | None:
-        """What the last frames lacked most often; None: it was used in all."""
+        """Reason why most of the last frames without the IMU went without; None: there is none."""
         lacking = [unused for unused in tuple(self._recently) if unused is not None]
         reasons = [unused.reason for unused in lacking]
         usual = max(reasons, key=reasons.count, default=None)
