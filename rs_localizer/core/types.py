@@ -208,27 +208,29 @@ class Estimate(Motion):
         motion in the covariance, and rotation and velocities then are linear in them.
         """
         later, motion = carried(numbers_of(self), tau, _NO_FADING)
-        rotation, translation = self._at(tau)
-        angular, linear = self.angular_velocity_at(tau), self.linear_velocity_at(tau)
-        turned = self.turned_beside(tau)  # camera axes at ``tau``
-        transport = np.zeros((PARAMETERS, len(self.joint_covariance)))
-        for k in range(0, PARAMETERS, 3):
-            transport[k : k + 3, :PARAMETERS] = turned @ motion[k : k + 3]
+        rotation, translation = Motion.at(self, tau)
+        turn, rate = self.shake_at(tau)
+        turned = so3.exp(-turn)  # camera axes at ``tau``
+        angular = turned @ Motion.angular_velocity_at(self, tau) + so3.right_jacobian(turn) @ rate
+        linear = turned @ Motion.linear_velocity_at(self, tau)
+        own = (turned @ motion.reshape(-1, 3, PARAMETERS)).reshape(PARAMETERS, PARAMETERS)
         values, rates = np.zeros(FUNCTIONS), np.zeros(FUNCTIONS)
         shake_basis(within_rows(tau), values, rates)
-        shaken, rates = (transport.shape[1] - PARAMETERS) // 3, rates * (tau == within_rows(tau))
-        unit, by_turn = np.eye(3), [np.eye(3), so3.hat(angular), so3.hat(linear)]
-        for part, by in zip((TURN, ANGULAR, LINEAR), by_turn, strict=True):
-            transport[part, PARAMETERS:] = np.kron(values[:shaken], by)
-        transport[ANGULAR, PARAMETERS:] += np.kron(rates[:shaken], unit)
+        rates *= tau == within_rows(tau)
+        shaken = (len(self.joint_covariance) - PARAMETERS) // 3
+        by, unit, across = np.zeros((PARAMETERS, shaken, 3)), np.eye(3), so3.hat(linear)
+        for part, change in ((TURN, unit), (ANGULAR, so3.hat(angular)), (LINEAR, across)):
+            by[part] = values[:shaken, None] * change[:, None]
+        by[ANGULAR] += rates[:shaken, None] * unit[:, None]
+        transport = np.hstack([own, by.reshape(PARAMETERS, 3 * shaken)])
         shared = transport[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
         joint = transport @ self.joint_covariance @ transport.T
         beyond, faster = beyond_rows(self, tau)
         joint[TURN, TURN] += beyond * unit
         joint[ANGULAR, ANGULAR] += faster * unit
-        joint[LINEAR, LINEAR] += beyond * (by_turn[2] @ by_turn[2].T)
+        joint[LINEAR, LINEAR] += beyond * (across @ across.T)
         return altered(
-            self, rotation=rotation, translation=translation,
+            self, rotation=turned @ rotation, translation=turned @ translation,
             angular_velocity=angular, linear_velocity=linear,
             angular_acceleration=turned @ later[4], linear_acceleration=turned @ later[5],
             joint_covariance=joint,
