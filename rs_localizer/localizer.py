@@ -68,7 +68,6 @@ from rs_localizer.estimation.prior import (
 )
 from rs_localizer.estimation.robust import GATE, WIDEST_GATE, best_motion
 from rs_localizer.estimation.search import Candidate, MotionSearch, generator
-from rs_localizer.estimation.window import step_from
 from rs_localizer.solvers.table import find_solver, start_solver
 
 # A prediction may be wrong by this multiple of the inlier threshold.
@@ -108,7 +107,8 @@ def _with_other(found: Estimate, tracked: Estimate) -> Estimate:
     Nobody knows how fast the track is: either the camera has gone farther, or a wrong lens shows
     it so.
     """
-    step = step_from(found, tracked)[:MOTION_PARAMETERS]
+    origin = np.zeros(3)
+    step = step_between(state_in(found, origin), state_in(tracked, origin))[:MOTION_PARAMETERS]
     moment = found.moved_covariance + np.outer(step, step)
     return altered(found, moved_covariance=moment)
 

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Literal, NoReturn, Self, TypeVar
 
@@ -15,7 +15,7 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray, real
 from rs_localizer.core.shake import FUNCTIONS, shake_at, shake_basis, within_rows
 from rs_localizer.core.shutter import Motion, carried, numbers_of
-from rs_localizer.core.state import ANGULAR, MOTION_PARAMETERS, PARAMETERS, TURN
+from rs_localizer.core.state import ANGULAR, LINEAR, MOTION_PARAMETERS, PARAMETERS, TURN
 from rs_localizer.native import entry
 
 if TYPE_CHECKING:  # kernels of other modules are compiled from this one, and not from words
@@ -198,39 +198,47 @@ class Estimate(Motion):
                 f"{seconds:g} s from the middle row is too far: the time is in seconds, and no "
                 f"motion goes on for more than {_LONGEST_AWAY:g}"
             )
-        tau = float(seconds) / self.span
-        later, transport = carried(numbers_of(self), tau, _NO_FADING)
-        rotation, translation = self._at(tau)
+        moved = self.moved_to(float(seconds) / self.span)
+        return altered(moved, time_ns=self.time_ns + round(1e9 * seconds))
+
+    def moved_to(self, tau: float) -> Estimate:
+        """Return the motion at a row time, also beyond the rows, with its covariance then.
+
+        Vibration turns the camera beside its motion: its coefficients stand behind those of the
+        motion in the covariance, and rotation and velocities then are linear in them.
+        """
+        later, motion = carried(numbers_of(self), tau, _NO_FADING)
+        rotation, translation = Motion.at(self, tau)
+        turn, rate = self.shake_at(tau)
+        turned = so3.exp(-turn)  # camera axes at ``tau``
+        angular = turned @ Motion.angular_velocity_at(self, tau) + so3.right_jacobian(turn) @ rate
+        linear = turned @ Motion.linear_velocity_at(self, tau)
+        own = (turned @ motion.reshape(-1, 3, PARAMETERS)).reshape(PARAMETERS, PARAMETERS)
         values, rates = np.zeros(FUNCTIONS), np.zeros(FUNCTIONS)
         shake_basis(within_rows(tau), values, rates)
-        shaken = len(self.shake)
-        transport = np.hstack([transport, np.zeros((PARAMETERS, 3 * shaken))])
-        for k in range(shaken):
-            own = slice(PARAMETERS + 3 * k, PARAMETERS + 3 * k + 3)
-            transport[TURN, own] = values[k] * np.eye(3)
-            transport[ANGULAR, own] = rates[k] * np.eye(3) if tau == within_rows(tau) else 0.0
-        turned = self.turned_beside(tau)  # camera axes at ``tau``
-        for k in range(0, PARAMETERS, 3):
-            transport[k : k + 3] = turned @ transport[k : k + 3]
+        rates *= tau == within_rows(tau)
+        shaken = (len(self.joint_covariance) - PARAMETERS) // 3
+        by, unit, across = np.zeros((PARAMETERS, shaken, 3)), np.eye(3), so3.hat(linear)
+        for part, change in ((TURN, unit), (ANGULAR, so3.hat(angular)), (LINEAR, across)):
+            by[part] = values[:shaken, None] * change[:, None]
+        by[ANGULAR] += rates[:shaken, None] * unit[:, None]
+        transport = np.hstack([own, by.reshape(PARAMETERS, 3 * shaken)])
         shared = transport[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
         joint = transport @ self.joint_covariance @ transport.T
-        for part, variance in zip((TURN, ANGULAR), beyond_rows(self, tau), strict=True):
-            joint[part, part] += variance * np.eye(3)
-        return replace(
-            self,
-            rotation=rotation,
-            translation=translation,
-            angular_velocity=self.angular_velocity_at(tau),
-            linear_velocity=self.linear_velocity_at(tau),
-            angular_acceleration=turned @ later[4],
-            linear_acceleration=turned @ later[5],
+        beyond, faster = beyond_rows(self, tau)
+        joint[TURN, TURN] += beyond * unit
+        joint[ANGULAR, ANGULAR] += faster * unit
+        joint[LINEAR, LINEAR] += beyond * (across @ across.T)
+        return altered(
+            self, rotation=turned @ rotation, translation=turned @ translation,
+            angular_velocity=angular, linear_velocity=linear,
+            angular_acceleration=turned @ later[4], linear_acceleration=turned @ later[5],
             joint_covariance=joint,
             calibration_covariance=shared @ self.calibration_covariance @ shared.T,
             undetected_covariance=shared @ self.undetected_covariance @ shared.T,
             moved_covariance=shared @ self.moved_covariance @ shared.T,
             shake=np.zeros((0, 3)),
-            time_ns=self.time_ns + round(1e9 * seconds),
-        )
+        )  # fmt: skip
 
     @property
     def position(self) -> Array:

@@ -12,7 +12,7 @@ With ``A x`` in the columns of the motion the prior of the rest is one of :class
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -30,7 +30,9 @@ from rs_localizer.estimation.linear_fit import (
 )
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.estimation.robust import inverse_of
-from rs_localizer.estimation.window import MotionSample
+
+if TYPE_CHECKING:
+    from rs_localizer.estimation.window import MotionSample
 
 # Sizes of vibration that the other knowledge misses, over ordinary ones; none at first. Without the
 # second, half of the twists before a small plane lie outside their regions (paired, gyro).

@@ -52,8 +52,7 @@ def atomic_directory(directory: Path, earlier: Iterable[str] = ()) -> Iterator[P
             built = work / final.name
             with _renamed({built: directory}):
                 yield built
-            made = sorted(built.iterdir()) if exists else [built]
-            _commit(work, made, earlier)
+            _commit(work, sorted(built.iterdir()) if exists else [built], earlier)
 
 
 @contextlib.contextmanager
@@ -103,10 +102,9 @@ def check_writable(place: Path) -> None:
         pass
 
 
-def remove_unfinished(folder: Path | None = None) -> None:
-    """Remove what was not finished: by this process, or, where no other works, in a folder."""
-    left = tuple(_unfinished) if folder is None else folder.glob(f"{_UNFINISHED}*")
-    for path in left:
+def remove_unfinished() -> None:
+    """Remove what this process has not finished."""
+    for path in tuple(_unfinished):
         shutil.rmtree(path, ignore_errors=True)
 
 
@@ -148,29 +146,26 @@ def _commit(work: Path, made: Sequence[Path], earlier: Sequence[str] = ()) -> No
         earlier: names that go.
     """
     made = [path for path in made if path.exists()]
-    for path in made:
-        _sync(path)
+    for file in (file for path in made for file in (path, *path.rglob("*"))):
+        if file.is_file() and not file.is_symlink():
+            with file.open("rb") as data:
+                os.fsync(data.fileno())  # a power failure may follow
     folder, old, changed = work.parent, work / _OLD, list[tuple[Path, Path]]()
     old.mkdir()
     moves = [(folder / name, old / name) for name in earlier if os.path.lexists(folder / name)]
-    with _undisturbed():
-        try:
-            for source, target in (*moves, *((path, folder / path.name) for path in made)):
-                os.rename(source, target)
-                changed.append((source, target))
-        except OSError:
-            # Without earlier names, a file took the place of another, and stays.
-            for source, target in reversed(changed if earlier else []):
-                os.rename(target, source)
-            raise
-
-
-def _sync(path: Path) -> None:
-    """Write a file, or the files in a folder, to the disk: a power failure may follow."""
-    for file in (path, *path.rglob("*")):
-        if file.is_file() and not file.is_symlink():
-            with file.open("rb") as data:
-                os.fsync(data.fileno())
+    # No signal comes while several names change.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
+    try:
+        for source, target in (*moves, *((path, folder / path.name) for path in made)):
+            os.rename(source, target)
+            changed.append((source, target))
+    except OSError:
+        # Without earlier names, a file took the place of another, and stays.
+        for source, target in reversed(changed if earlier else []):
+            os.rename(target, source)
+        raise
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextlib.contextmanager
@@ -185,13 +180,3 @@ def _renamed(names: dict[Path, Path]) -> Iterator[None]:
         if text == str(error):
             raise
         raise type(error)(text) from error
-
-
-@contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Delay signals within the context, while several names change."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

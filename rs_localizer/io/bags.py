@@ -15,15 +15,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Self
 
+from rosbags import interfaces as qos
 from rosbags.highlevel import AnyReader
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.errors import WriterError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -37,10 +30,10 @@ _METADATA, _SUFFIXES = "metadata.yaml", (".mcap", ".db3", ".bag")
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 # Players advertise topics with the QoS recorded in the bag; subscribers to /tf_static expect
 # transient-local durability.
-_NO_LIMIT = QosTime(2**31 - 1, 10**9 - 1)
-_LATCHED = Qos(
-    QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,
-    _NO_LIMIT, _NO_LIMIT, QosLiveliness.AUTOMATIC, _NO_LIMIT, False,
+_NO_LIMIT = qos.QosTime(2**31 - 1, 10**9 - 1)
+_LATCHED = qos.Qos(
+    qos.QosHistory.KEEP_LAST, 1, qos.QosReliability.RELIABLE, qos.QosDurability.TRANSIENT_LOCAL,
+    _NO_LIMIT, _NO_LIMIT, qos.QosLiveliness.AUTOMATIC, _NO_LIMIT, False,
 )  # fmt: skip
 
 

@@ -17,16 +17,8 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel
+from rs_localizer.io import reading
 from rs_localizer.io.camera_info import interpret_lens
-from rs_localizer.io.reading import (
-    LENS,
-    YamlError,
-    dump_yaml,
-    file_faults,
-    load_yaml,
-    parameter_blocks,
-    read_text,
-)
 
 # Order of OpenCV's coefficients, by their names.
 _ORDER = {
@@ -70,7 +62,7 @@ def read_calibration(path: Path | str) -> Camera:
     if (match := _CHOICE.fullmatch(str(path))) is not None and not path.exists():
         path, chosen = Path(match[1]), match[2]
     with calibration_faults(path, "YAML or JSON", "not a usable calibration"):
-        camera = _camera(read_text(path, "utf-8-sig"), chosen)
+        camera = _camera(reading.read_text(path, "utf-8-sig"), chosen)
         x, y = camera.K[:2, 2]
         if not (0.0 < x < camera.width and 0.0 < y < camera.height):
             raise ValueError(
@@ -83,10 +75,10 @@ def read_calibration(path: Path | str) -> Camera:
 @contextlib.contextmanager
 def calibration_faults(path: Path, kind: str, unusable: str) -> Iterator[None]:
     """Name the file in faults within the context, of the file and of its content."""
-    with file_faults(path, CalibrationError, kind):
+    with reading.file_faults(path, CalibrationError, kind):
         try:
             yield
-        except (YamlError, UnicodeDecodeError):
+        except (reading.YamlError, UnicodeDecodeError):
             raise
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             fault = f"no {error}" if isinstance(error, KeyError) else str(error)
@@ -98,11 +90,13 @@ def _camera(text: str, chosen: str | None) -> Camera:
     if _LINE.match(next(lines, "")) is not None:
         return colmap_camera(text, chosen)
     if text.lstrip()[:1] == "<":
-        raise YamlError("it is XML, which OpenCV's FileStorage writes as .yaml or .json, too")
-    tree = load_yaml(_TAG.sub("", _DIRECTIVE.sub("", text)))
+        raise reading.YamlError(
+            "it is XML, which OpenCV's FileStorage writes as .yaml or .json, too"
+        )
+    tree = reading.load_yaml(_TAG.sub("", _DIRECTIVE.sub("", text)))
     tree = tree if isinstance(tree, dict) else {}
-    blocks = (block for _, block in parameter_blocks(tree) if isinstance(block, dict))
-    tree = next((block[LENS] for block in blocks if LENS in block), tree)
+    blocks = (block for _, block in reading.parameter_blocks(tree) if isinstance(block, dict))
+    tree = next((block[reading.LENS] for block in blocks if reading.LENS in block), tree)
     own = {"camera_matrix", "image_width"}  # of one of the cameras of ``calibrate --rig``
     cameras = {
         name: item for name, item in tree.items()
@@ -320,7 +314,7 @@ def write_calibration(path: Path, camera: Camera) -> None:
         "rectification_matrix": _matrix(np.eye(3)),
         "projection_matrix": _matrix(np.hstack([camera.K, np.zeros((3, 1))])),
     }
-    path.write_text(dump_yaml(tree), encoding="utf-8")
+    path.write_text(reading.dump_yaml(tree), encoding="utf-8")
 
 
 def _matrix(values: Array) -> dict[str, Any]:

@@ -123,9 +123,6 @@ class _Rows:
     dropped: int  # rows that held NaN or infinity
     values: dict[str, Array]  # (n,) of each field of one real number
 
-    def has(self, name: str) -> bool:
-        return name in (self.table.dtype.names or ())
-
     def columns(self, *names: str) -> Array:
         """Return fields of one real number each as an array (n, len(names))."""
         return np.stack([self.values[name] for name in names], axis=1)
@@ -319,11 +316,12 @@ def read_map(message: Any) -> Map:
 
 def _marks(rows: _Rows, message: Any) -> tuple[Ids | None, Descriptors | None]:
     """Return ids (n,) and descriptors (n,d) by which the points are recognized."""
-    if not rows.has("id") and not rows.has("descriptor"):
+    known = rows.table.dtype.names or ()
+    if not {"id", "descriptor"} & set(known):
         names = ", ".join(str(item.name) for item in message.fields)
         raise MessageError(f"the cloud has neither a field id nor descriptor; found {names}")
-    ids = rows.table["id"].astype(np.int64) if rows.has("id") else None
-    if not rows.has("descriptor"):
+    ids = rows.table["id"].astype(np.int64) if "id" in known else None
+    if "descriptor" not in known:
         return ids, None
     descriptors = rows.table["descriptor"]
     native = descriptors.dtype.newbyteorder("=")

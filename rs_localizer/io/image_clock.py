@@ -36,12 +36,11 @@ class ImageClock:
 
     @property
     def _zero_ns(self) -> int:
-        """Stamp of the zero of the file's clock."""
+        """Stamp of the zero of the file's clock; a rate counts from it, or from the first image."""
         return 0 if self.absolute else DEFAULT_START_NS
 
     @property
     def _start_ns(self) -> int:
-        """Stamp of the first image, of those that come at a rate."""
         return self._first_ns if self.absolute else DEFAULT_START_NS
 
     def stamp(self, own_ns: int | None) -> int | None:
@@ -50,13 +49,10 @@ class ImageClock:
         Raises:
             ValueError: when the file has no times and no rate was given.
         """
-        index = self._images
-        self._images += 1
+        index, self._images = self._images, self._images + 1
         if own_ns is not None:
-            if self._timed == 0:
-                self._first_ns = own_ns
-            self._last_ns = own_ns
-            self._timed += 1
+            self._first_ns = self._first_ns if self._timed else own_ns
+            self._last_ns, self._timed = own_ns, self._timed + 1
         if self.rate is not None:
             return self._start_ns + round(index * 1e9 / self.rate)
         if own_ns is None and index <= 1:  # the first is at 0 in a file without times, too
@@ -100,11 +96,7 @@ class ImageClock:
         factor = self.captured / pace
         if 1.0 / _OTHER_RATE < factor < _OTHER_RATE:
             return None
-        off = (
-            f"{factor:.3g} times too small"
-            if factor > 1.0
-            else f"{1.0 / factor:.3g} times too large"
-        )
+        off = f"{max(factor, 1.0 / factor):.3g} times too {'small' if factor > 1.0 else 'large'}"
         return (
             f"the camera took {self.captured:.4g} images/s, as the file notes, and its times mean "
             f"{pace:.4g}: in slow motion or time lapse velocities are {off}; --rate "

@@ -90,17 +90,13 @@ def _sent(covariance: Array) -> Array:
     return known.ravel()
 
 
-def make_pose(pose: BodyPose, make: Make) -> Any:
-    """Return the geometry_msgs/Pose of a pose."""
+def make_pose_with_covariance(pose: BodyPose, make: Make) -> Any:
+    """Return the geometry_msgs/PoseWithCovariance of a pose."""
     position = make_vector(make, pose.position, "Point")
     orientation = make_quaternion(make, pose.rotation)
-    return make("geometry_msgs/msg/Pose", position=position, orientation=orientation)
-
-
-def make_pose_with_covariance(pose: BodyPose, make: Make, made: Any = None) -> Any:
-    """Return the geometry_msgs/PoseWithCovariance of a pose, whose message may be made already."""
+    made = make("geometry_msgs/msg/Pose", position=position, orientation=orientation)
     kind, covariance = "geometry_msgs/msg/PoseWithCovariance", _sent(pose.covariance)
-    return make(kind, pose=made or make_pose(pose, make), covariance=covariance)
+    return make(kind, pose=made, covariance=covariance)
 
 
 def messages(frame: Localized, make: Make, wanted: Collection[str] = TYPES) -> dict[str, Any]:
@@ -120,9 +116,8 @@ def messages(frame: Localized, make: Make, wanted: Collection[str] = TYPES) -> d
             made[name] = make(TYPES[name], header=header(axes), **fields)
 
     if set(wanted) - {topics.INLIERS}:
-        pose = make_pose(frame.pose, make)
-        sure = make_pose_with_covariance(frame.pose, make, pose)
-        add(topics.POSE, frame.map_frame, pose=pose)
+        sure = make_pose_with_covariance(frame.pose, make)
+        add(topics.POSE, frame.map_frame, pose=sure.pose)
         add(topics.POSE_WITH_COVARIANCE, frame.map_frame, pose=sure)
         if frame.twist is not None:
             twist = frame.known_twist or _UNKNOWN

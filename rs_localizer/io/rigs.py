@@ -26,12 +26,7 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.camera_files import (
-    calibration_faults,
-    kalibr_camera,
-    lens_camera,
-    lens_parameters,
-)
+from rs_localizer.io import camera_files
 from rs_localizer.io.reading import LENS, flat, load_yaml, parameter_blocks, read_text
 from rs_localizer.io.transforms import Transform
 
@@ -58,7 +53,7 @@ def read_camchain(path: Path | str) -> RigParts:
     Raises:
         CalibrationError: for anything else, saying what was found.
     """
-    with calibration_faults(path := Path(path), "YAML or JSON", "no usable rig"):
+    with camera_files.calibration_faults(path := Path(path), "YAML or JSON", "no usable rig"):
         tree = load_yaml(read_text(path))
         own = [parameters for _, parameters in parameter_blocks(tree)]
         return _read_own_rig(own[0]) if own else _camchain(tree)
@@ -70,7 +65,7 @@ def mounted_lenses(parts: RigParts) -> dict[str, Any]:
     for name, camera in parts.cameras.items():
         mount = np.eye(4)
         mount[:3, :3], mount[:3, 3] = parts.camera_from_rig[name]
-        lenses[name] = lens_parameters(camera) | {_MOUNT: mount.ravel().tolist()}
+        lenses[name] = camera_files.lens_parameters(camera) | {_MOUNT: mount.ravel().tolist()}
     return lenses
 
 
@@ -80,7 +75,7 @@ def _read_own_rig(tree: Any) -> RigParts:
     for name in values["cameras"]:
         lens = tree[LENS][name]
         own = {of: values[key] for of in _SHUTTER if (key := f"{name}.{of}") in values}
-        cameras[name] = replace(lens_camera(lens), **own)
+        cameras[name] = replace(camera_files.lens_camera(lens), **own)
         pose = _rigid(_MOUNT, np.reshape(lens[_MOUNT], (4, 4)))
         poses[name] = pose[:3, :3].copy(), pose[:3, 3].copy()
         offsets[name] = float(values.get(f"{name}.stamp_offset", 0.0))
@@ -98,7 +93,7 @@ def _camchain(tree: Any) -> RigParts:
             if not isinstance(item, dict):
                 raise ValueError(f"expected a mapping, found {item!r}")
             shutter = {of: item[of] for of in _SHUTTER if of in item}
-            cameras[str(name)] = replace(kalibr_camera(item), **shutter)
+            cameras[str(name)] = replace(camera_files.kalibr_camera(item), **shutter)
             if by_imu:
                 pose = _rigid(_IMU, item[_IMU])
             elif place > 0:

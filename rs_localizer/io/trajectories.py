@@ -93,9 +93,7 @@ def write_tum(path: Path | str, trajectory: Trajectory, about: Sequence[str] = (
     Args:
         about: lines of comment before the data.
     """
-    values = np.hstack([trajectory.positions, trajectory.quaternions])
-    title = (*about, "t x y z qx qy qz qw")
-    _write_table(Path(path), title, trajectory.stamps_ns, values)
+    _write_table(path, (*about, "t x y z qx qy qz qw"), trajectory)
 
 
 def read_twists(path: Path | str) -> Twists:
@@ -106,8 +104,7 @@ def read_twists(path: Path | str) -> Twists:
 
 def write_twists(path: Path | str, twists: Twists, about: Sequence[str] = ()) -> None:
     """Write a twist file as :func:`write_tum` does."""
-    values = np.hstack([twists.angular, twists.linear])
-    _write_table(Path(path), (*about, "t wx wy wz vx vy vz"), twists.stamps_ns, values)
+    _write_table(path, (*about, "t wx wy wz vx vy vz"), twists)
 
 
 def split_at_gaps(trajectory: Trajectory) -> list[Trajectory]:
@@ -189,12 +186,11 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
         raise TrajectoryError(f"{path} cannot be read as text: {error}") from error
 
 
-def _write_table(
-    path: Path, comments: Iterable[str], stamps_ns: Iterable[int], values: Array
-) -> None:
-    with _open(path, "w") as file:
+def _write_table(path: Path | str, comments: Iterable[str], rows: Trajectory | Twists) -> None:
+    stamps_ns, *values = (getattr(rows, each.name) for each in fields(rows))
+    with _open(Path(path), "w") as file:
         file.writelines(f"# {line}\n" for line in comments)
-        for stamp_ns, row in zip(stamps_ns, values.tolist(), strict=True):
+        for stamp_ns, row in zip(stamps_ns, np.hstack(values).tolist(), strict=True):
             file.write(f"{format_stamp(stamp_ns)} {' '.join(map(repr, row))}\n")
 
 

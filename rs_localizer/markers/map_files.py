@@ -22,17 +22,9 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.io.reading import dump_yaml, file_faults, load_yaml, read_text
+from rs_localizer.markers import prints
 from rs_localizer.markers.families import FAMILIES, Family, family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
-from rs_localizer.markers.prints import (
-    Board,
-    Charuco,
-    Chessboard,
-    Marker,
-    Pose,
-    finite,
-    rotation_of_quaternion,
-)
 
 USUAL_FAMILY = FAMILIES["apriltag_36h11"]
 """Family of files of other programs that do not say it."""
@@ -88,26 +80,28 @@ def read_any(path: Path, kind: Family | None = None) -> tuple[MarkerMap, str]:
         raise MarkerMapError(f"{path}: {error}") from error
 
 
-def _marker(entry: _Entry) -> Marker:
+def _marker(entry: _Entry) -> prints.Marker:
     name, number = entry.value("family", str), entry.value("id", int)
     entry.where += f" ({name} {number})"
     with entry.named():
         known = [entry.value(f"{of}_deviation", list, None) for of in ("position", "rotation")]
-        deviations = None if known == [None, None] else finite(known, (2, 3), "deviations").ravel()
+        deviations = (
+            None if known == [None, None] else prints.finite(known, (2, 3), "deviations").ravel()
+        )
         corners = entry.value("corners", list, None)
         size = entry.value("size", _NUMBER, *(() if corners is None else (None,)))
         if corners is None:
             pose = _pose(entry)
             entry.finish()
-            return replace(Marker.at(name, number, size, pose), deviations=deviations)
+            return replace(prints.Marker.at(name, number, size, pose), deviations=deviations)
         entry.finish()
-        marker = Marker(family(name), number, corners, deviations)
+        marker = prints.Marker(family(name), number, corners, deviations)
         if size is not None and abs(marker.size - size) > _SIZE_TOLERANCE * abs(size):
             raise ValueError(f"its corners are {marker.size:.4g} m apart, but size is {size:g}")
         return marker
 
 
-def _board(entry: _Entry) -> Board:
+def _board(entry: _Entry) -> prints.Board:
     kind = entry.value("type", str)
     entry.where += f" ({kind})"
     with entry.named():
@@ -124,18 +118,18 @@ def _board(entry: _Entry) -> Board:
             marker, name = float(entry.value("marker", _NUMBER)), entry.value("family", str)
             own = entry.value("first_id", int, 0), entry.value("legacy", bool, False)
             entry.finish()
-            return Charuco(*counts, square, marker, family(name), *own, **given)
+            return prints.Charuco(*counts, square, marker, family(name), *own, **given)
         entry.finish()
-        return Chessboard(*counts, square, **given)
+        return prints.Chessboard(*counts, square, **given)
 
 
-def _pose(entry: _Entry) -> Pose:
+def _pose(entry: _Entry) -> prints.Pose:
     position, rotation = entry.value("position", list), entry.value("rotation", list, None)
     if rotation is None:
-        return Pose(position, rotation_of_quaternion(entry.value("quaternion", list)))
+        return prints.Pose(position, prints.rotation_of_quaternion(entry.value("quaternion", list)))
     if "quaternion" in entry:
         raise ValueError("there are both a rotation and a quaternion")
-    return Pose(position, rotation)
+    return prints.Pose(position, rotation)
 
 
 def _aprilgrid(entry: _Entry) -> MarkerMap:
@@ -145,14 +139,14 @@ def _aprilgrid(entry: _Entry) -> MarkerMap:
     size, gap = entry.value("tagSize", _NUMBER), entry.value("tagSpacing", _NUMBER)
     name, pitch = FAMILIES["apriltag_36h11_border2"].name, size * (1.0 + gap)
     return MarkerMap(tuple(
-        Marker.at(name, k, size, Pose(np.array([
+        prints.Marker.at(name, k, size, prints.Pose(np.array([
             pitch * (k % columns) + 0.5 * size, pitch * (k // columns) + 0.5 * size, 0.0
         ])))
         for k in range(columns * rows)
     ))  # fmt: skip
 
 
-def _bundle(file: _Entry, name: str) -> Iterator[Marker]:
+def _bundle(file: _Entry, name: str) -> Iterator[prints.Marker]:
     bundles = {
         str(bundle.value("name", (str, int), f"{index}")): bundle
         for index, bundle in enumerate(file.entries("tag_bundles", "bundle"))
@@ -174,8 +168,8 @@ def _bundle(file: _Entry, name: str) -> Iterator[Marker]:
         )
         turn = qx, qy, qz, float(tag.value("qw", _NUMBER, 1.0))
         with tag.named():
-            pose = Pose(np.array([x, y, z]), rotation_of_quaternion(turn))
-            yield Marker.at(name, number, size, pose)
+            pose = prints.Pose(np.array([x, y, z]), prints.rotation_of_quaternion(turn))
+            yield prints.Marker.at(name, number, size, pose)
 
 
 _EXPLANATION = """\
@@ -200,9 +194,9 @@ def write_marker_map(path: Path | str, marker_map: MarkerMap) -> None:
     Path(path).write_text(_EXPLANATION + dump_yaml(tree), encoding="utf-8")
 
 
-def _marker_entry(marker: Marker) -> dict[str, Any]:
+def _marker_entry(marker: prints.Marker) -> dict[str, Any]:
     entry: dict[str, Any] = {"family": marker.family.name, "id": marker.id}
-    square = Marker.at(marker.family.name, marker.id, marker.size, marker.pose)
+    square = prints.Marker.at(marker.family.name, marker.id, marker.size, marker.pose)
     if np.abs(square.corners - marker.corners).max() > _SAME * marker.size:
         entry["corners"] = [_rounded(row) for row in marker.corners]
     else:
@@ -213,12 +207,12 @@ def _marker_entry(marker: Marker) -> dict[str, Any]:
     return entry
 
 
-def _board_entry(board: Board) -> dict[str, Any]:
+def _board_entry(board: prints.Board) -> dict[str, Any]:
     entry: dict[str, Any] = {
-        "type": _CHARUCO if isinstance(board, Charuco) else _CHESSBOARD,
+        "type": _CHARUCO if isinstance(board, prints.Charuco) else _CHESSBOARD,
         "columns": board.columns, "rows": board.rows, "square": float(board.square),
     }  # fmt: skip
-    if isinstance(board, Charuco):
+    if isinstance(board, prints.Charuco):
         entry |= {"marker": float(board.marker), "family": board.family.name}
         entry |= {"first_id": board.first_id, "legacy": board.legacy}
     entry |= _pose_entry(board.pose)
@@ -229,7 +223,7 @@ def _board_entry(board: Board) -> dict[str, Any]:
     return entry
 
 
-def _pose_entry(pose: Pose) -> dict[str, Any]:
+def _pose_entry(pose: prints.Pose) -> dict[str, Any]:
     from rs_localizer.core import so3  # kernels: a command that shows its help imports none
 
     quaternion = so3.quaternion(np.ascontiguousarray(pose.rotation))

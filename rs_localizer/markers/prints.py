@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.io.transforms import from_numbers
 from rs_localizer.markers.families import Family, family
 
 # Corners that were measured are no exact square. Their largest distance from one, in sides.
@@ -76,13 +77,7 @@ def rotation_of_quaternion(quaternion: ArrayLike) -> Array:
     if abs(length - 1.0) > _LENGTH_TOLERANCE:
         raise ValueError(f"the quaternion (x y z w) must have the length 1, found {length:.4g}")
     x, y, z, w = q / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return from_numbers((0.0, 0.0, 0.0), (x, y, z, w)).rotation
 
 
 def finite(values: ArrayLike, shape: tuple[int, ...], name: str) -> Array:

@@ -139,7 +139,7 @@ def usable(
         ValueError: when they and their calibration differ in size, or, without one, they are of
             several sizes.
     """
-    cameras, size = Cameras(scan_direction), None
+    cameras, size = _Cameras(scan_direction), None
     for shot in shots:
         if isinstance(shot, Carried):
             continue
@@ -163,7 +163,6 @@ def usable(
                 )
             yield shot, image, camera
         done()
-    cameras.check()
 
 
 class _MarkerTally:
@@ -234,21 +233,20 @@ class _MarkerTally:
         return self._found
 
 
-class Cameras:
+class _Cameras:
     """The camera of each image, mostly the camera of the image before."""
 
     def __init__(self, scan_direction: str) -> None:
         self._scan_direction = scan_direction
         self._last: tuple[Calibration, Camera] | None = None
-        self._fit = 0  # images of the size of their calibration
-        self._misfit, self._fault = 0, ""  # images of another one, and what the first of them is
+        self._fits, self._misfits = False, 0  # whether an image has the calibration's size; others
 
     def camera_of(self, shot: Shot, image: Image) -> Camera | Refusal:
         """Return the camera of one image, or refuse it if its size is another one.
 
         Raises:
-            ValueError: when its camera_info cannot be used, or the first images are all of
-                another size.
+            ValueError: when its camera_info cannot be used, or the first images are of another
+                size.
         """
         try:
             calibration = read_camera_info(shot.camera_info)
@@ -257,27 +255,16 @@ class Cameras:
         except MessageError as error:
             raise ValueError(f"the camera_info cannot be used: {error}") from error
         camera = self._last[1]
-        height, width = image.pixels.shape
-        if (width, height) != camera.size:
-            self._misfit += 1
-            self._fault = self._fault or (
-                f"the images are of {width}x{height}, the calibration is for "
-                f"{camera.size[0]}x{camera.size[1]}{_why((width, height), camera.size)}"
-            )
-            if self._misfit >= _MISFITS:
-                self.check()
-            return Refusal(
-                Reason.BAD_IMAGE,
-                f"the image at {1e-9 * image.stamp_ns:.3f} s is of {width}x{height}, the "
-                f"calibration is for {camera.size[0]}x{camera.size[1]}",
-            )
-        self._fit += 1
-        return camera
-
-    def check(self) -> None:
-        """Raise ValueError if no image so far was of the size of its calibration."""
-        if self._misfit and not self._fit:
-            raise ValueError(self._fault)
+        (height, width), (across, down) = image.pixels.shape, camera.size
+        sizes = f"of {width}x{height}, the calibration is for {across}x{down}"
+        if (width, height) == camera.size:
+            self._fits = True
+            return camera
+        self._misfits += 1
+        if self._misfits >= _MISFITS and not self._fits:
+            raise ValueError(f"the images are {sizes}{_why((width, height), camera.size)}")
+        text = f"the image at {1e-9 * image.stamp_ns:.3f} s is {sizes}"
+        return Refusal(Reason.BAD_IMAGE, text)
 
 
 def _why(size: tuple[int, int], calibrated: tuple[int, int]) -> str:
@@ -329,7 +316,7 @@ def record_features(
     extraction = Extraction()
     kept = _kept(shots, bag, extraction)
     for shot, image, _ in usable(kept, options.scan_direction, extraction, done):
-        extracted = extractor.extract(image)
+        extracted = extractor.detect(image)
         if len(extracted.features):
             extraction.counts.append(len(extracted.features))
             _write(bag, shot, KEYPOINTS_TOPIC, keypoints(extracted, make_message), options)

@@ -353,7 +353,7 @@ def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterato
     :data:`NO_FRAMES`.
     """
     rows = inputs_of(localizer.config)
-    inputs = {topic: rows[name] for name, topic in topics.of.items()}
+    by_topic = {topic: rows[name] for name, topic in topics.of.items()}
 
     def awaits(item: tuple[str, int, Any]) -> bool:
         topic, _, message = item
@@ -367,14 +367,14 @@ def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterato
     for name, topic in topics.of.items():  # which recorders may write last
         if name.endswith(CAMERA_INFO):
             first = next((message for _, _, message in bag.messages((topic,))), None)
-            list(_each(inputs[topic].take_message(localizer, first)) if first is not None else ())
+            list(_each(by_topic[topic].take_message(localizer, first)) if first is not None else ())
     messages = imu_first(bag.messages(topics.names), topics.of.get(IMU), awaits)
     last: Item | None = None
     for last in messages:
         topic, recorded_ns, message = last
         # A stamp of 0 is a time where a recording has its message at 0, too.
         localizer.stream.zero_is_time = recorded_ns == 0
-        for result in _each(inputs[topic].take_message(localizer, message)):
+        for result in _each(by_topic[topic].take_message(localizer, message)):
             yield answer(recorded_ns, message, result)
     for result in localizer.flush():
         assert last is not None  # which waits

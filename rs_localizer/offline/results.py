@@ -42,7 +42,7 @@ from rs_localizer.io.transforms import TransformError, make_transform
 from rs_localizer.offline.fleet import Figures
 from rs_localizer.offline.frame_table import FrameTable
 from rs_localizer.offline.replay import NO_FRAMES, TF_TYPE, Answer, Topics, replay
-from rs_localizer.pipeline.aid import AidState
+from rs_localizer.pipeline.aid import AidInput
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.map_to_odom import CorrectionState
 from rs_localizer.pipeline.published import broadcast
@@ -150,7 +150,7 @@ class Tally:
     seconds: float = 0.0
     moving: bool = False  # whether there are twists
     smoothed: Any = None  # what became of the moments of one that was smoothed
-    aid: AidState | None = None
+    aid: AidInput | None = None
     readout: tuple[float, float] | None = None  # s, as the motion shows it, and its deviation
     _stamps_ns: array[int] = field(default_factory=lambda: array("q"))  # of the images
     _numbers: array[float] = field(default_factory=lambda: array("d"))
@@ -176,7 +176,7 @@ class Tally:
             # Images of several cameras are one frame.
             lost = sum(n for reason, n in self.refused.items() if reason not in NO_FRAMES)
             self.total = self.localized + lost
-        self.aid = localizer.aid.state
+        self.aid = localizer.aid
         if (measured := localizer.tracker.shutter.measured) is not None:
             self.readout = measured.readout_time, measured.deviation
 

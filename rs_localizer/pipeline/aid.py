@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -49,63 +49,6 @@ _SOME = 30
 _ANY_OFFSET, _GIVEN_OFFSET = 0.02, 0.002
 
 
-@dataclass(frozen=True, slots=True)
-class AidState:
-    """State of the IMU, for people."""
-
-    share: float  # of the last frames
-    mostly: Unused | None  # most frequent of the last frames; None: it was used in all
-    reasons: dict[ImuReason, int]  # frames that went without, by reason
-    details: dict[ImuReason, str]  # the latest of each, one sentence
-    rate: float  # Hz; NaN: unknown
-    time_offset: float  # s to be added to its stamps, in all; NaN: unknown
-    status: InertialStatus | None  # what the frames say of the gyroscope
-    # rad, between gravity as the accelerometer shows it and gravity_in_map; NaN: not known yet;
-    # None: imu.gravity is off
-    gravity: float | None = None
-
-    def values(self) -> dict[str, str]:
-        """Return values by readable names, without what is not known."""
-        alone = self.mostly if self.share < _FEW else None
-        use = "used" if alone is None else f"not used: {alone.detail}"
-        values = {"IMU": use, "IMU used (share of the last frames)": f"{self.share:.0%}"}
-        if self.gravity is not None:
-            finite = math.isfinite(self.gravity)
-            values["IMU gravity off gravity_in_map (deg)"] = (
-                f"{math.degrees(self.gravity):.1f}" if finite else "not known yet"
-            )
-        if math.isfinite(self.rate):
-            values["IMU rate (Hz)"] = f"{self.rate:.1f}"
-        status = self.status
-        if status is not None and np.all(np.isfinite(status.bias)):
-            bias = " ".join(f"{value:.3f}" for value in np.degrees(status.bias))
-            deviation = math.degrees(status.bias_deviation)
-            values["IMU bias (deg/s, camera axes)"] = f"{bias} +- {deviation:.3f}"
-        if status is not None and status.oddity:
-            values["IMU contradicted by the camera"] = status.oddity
-        if status is not None and math.isfinite(self.time_offset):
-            offset, deviation = 1e3 * self.time_offset, 1e3 * status.time_offset_deviation
-            values["IMU time offset (ms)"] = f"{offset:.2f} +- {deviation:.2f}"
-        return values | {f"IMU not used: {reason}": str(n) for reason, n in self.reasons.items()}
-
-    def oddities(self) -> dict[str, str]:
-        """Return why the camera goes on alone, and what contradicts gyroscope and gravity."""
-        oddities = {}
-        if self.mostly is not None and self.share < _FEW:
-            unused = f"{self.mostly.reason}: {self.mostly.detail}"
-            oddities["imu"] = f"the IMU is not used, {unused}"
-        if self.status is not None and self.status.oddity:
-            said = f"the camera's rotation says of the gyroscope: {self.status.oddity}"
-            oddities["imu.gyroscope"] = said
-        if self.gravity is not None and self.gravity > _MOST_TILT:
-            oddities["imu.gravity"] = (
-                f"the accelerometer shows gravity {math.degrees(self.gravity):.0f} degrees off "
-                "gravity_in_map: is that the direction in which things fall in the map, and does "
-                "TF know the IMU's axes?"
-            )
-        return oddities
-
-
 class Moment(NamedTuple):
     """A time, and what readings of that time are for."""
 
@@ -139,13 +82,15 @@ class AidInput:
         self._recently: deque[Unused | None] = deque(maxlen=_MANY)
         self._force_in_map = np.zeros(3)  # mean of the last frames
         self._with_force = 0  # how many
-        self._gravity: float | None = None
-        self._reasons: Counter[ImuReason] = Counter()
-        self._details: dict[ImuReason, str] = {}
+        # rad, between gravity as the accelerometer shows it and gravity_in_map; NaN: not known yet;
+        # None: imu.gravity is off
+        self.gravity: float | None = None
+        self.reasons: Counter[ImuReason] = Counter()  # of frames that went without
+        self.details: dict[ImuReason, str] = {}  # the latest of each, one sentence
         self._in_a_row: deque[ImuReason] = deque(maxlen=_LONG)
         self._reported: ImuReason | None = None
         self._odd = 0  # frames in a row that say what the gyroscope has
-        self._status: InertialStatus | None = None
+        self._status: InertialStatus | None = None  # what the frames say of the gyroscope
         self._given_offset = 0.0
         self._lacking: Unused | None = None  # why the present frame has no samples
 
@@ -164,24 +109,60 @@ class AidInput:
         return "" if self._buffer is None else self._buffer.frame
 
     @property
-    def state(self) -> AidState | None:
-        """For the diagnostics; None as long as no frame has met an IMU."""
+    def share(self) -> float:
+        """Share of the last frames that used it; NaN as long as none has met an IMU."""
         recently = tuple(self._recently)
-        if not recently or self._buffer is None:
-            return None
-        estimated = math.nan if self._status is None else self._status.time_offset
-        reasons = [unused.reason for unused in recently if unused is not None]
+        return recently.count(None) / len(recently) if recently else math.nan
+
+    @property
+    def mostly(self) -> Unused | None:
+        """Reason why most of the last frames without the IMU went without; None: there is none."""
+        lacking = [unused for unused in tuple(self._recently) if unused is not None]
+        reasons = [unused.reason for unused in lacking]
         usual = max(reasons, key=reasons.count, default=None)
-        return AidState(
-            recently.count(None) / len(recently),
-            next((u for u in reversed(recently) if u is not None and u.reason == usual), None),
-            dict(self._reasons),
-            dict(self._details),
-            self._buffer.rate(),
-            self._given_offset + estimated,
-            self._status,
-            self._gravity,
-        )
+        return next((unused for unused in reversed(lacking) if unused.reason == usual), None)
+
+    def values(self) -> dict[str, str]:
+        """Return values by readable names, without what is not known."""
+        share, mostly, status = self.share, self.mostly, self._status
+        if math.isnan(share) or self._buffer is None:
+            return {}
+        use = "used" if mostly is None or share >= _FEW else f"not used: {mostly.detail}"
+        values = {"IMU": use, "IMU used (share of the last frames)": f"{share:.0%}"}
+        if (gravity := self.gravity) is not None:
+            off = f"{math.degrees(gravity):.1f}" if math.isfinite(gravity) else "not known yet"
+            values["IMU gravity off gravity_in_map (deg)"] = off
+        if math.isfinite(rate := self._buffer.rate()):
+            values["IMU rate (Hz)"] = f"{rate:.1f}"
+        if status is not None and np.all(np.isfinite(status.bias)):
+            bias = " ".join(f"{value:.3f}" for value in np.degrees(status.bias))
+            deviation = math.degrees(status.bias_deviation)
+            values["IMU bias (deg/s, camera axes)"] = f"{bias} +- {deviation:.3f}"
+        if status is not None and status.oddity:
+            values["IMU contradicted by the camera"] = status.oddity
+        if status is not None and math.isfinite(status.time_offset):
+            offset, deviation = (
+                self._given_offset + status.time_offset,
+                status.time_offset_deviation,
+            )
+            values["IMU time offset (ms)"] = f"{1e3 * offset:.2f} +- {1e3 * deviation:.2f}"
+        return values | {f"IMU not used: {name}": str(n) for name, n in dict(self.reasons).items()}
+
+    def oddities(self) -> dict[str, str]:
+        """Return why the camera goes on alone, and what contradicts gyroscope and gravity."""
+        oddities, mostly = {}, self.mostly
+        if mostly is not None and self.share < _FEW:
+            oddities["imu"] = f"the IMU is not used, {mostly.reason}: {mostly.detail}"
+        if self._status is not None and self._status.oddity:
+            said = f"the camera's rotation says of the gyroscope: {self._status.oddity}"
+            oddities["imu.gyroscope"] = said
+        if (gravity := self.gravity) is not None and gravity > _MOST_TILT:
+            oddities["imu.gravity"] = (
+                f"the accelerometer shows gravity {math.degrees(gravity):.0f} degrees off "
+                "gravity_in_map: is that the direction in which things fall in the map, and does "
+                "TF know the IMU's axes?"
+            )
+        return oddities
 
     def awaits(self, frame: Moment, patience: float) -> bool:
         """Return True if missing readings of this exposure may come within so many seconds."""
@@ -238,17 +219,17 @@ class AidInput:
     ) -> None:
         """Compare the accelerometer's gravity with gravity_in_map, if that is used."""
         if not config.imu.gravity:
-            self._gravity, self._with_force = None, 0
+            self.gravity, self._with_force = None, 0
             return
         if result and samples.specific_force is not None:
             force = result.rotation.T @ samples.specific_force.mean(axis=0)
             self._with_force = min(self._with_force + 1, _MANY)
             self._force_in_map += (force - self._force_in_map) / self._with_force
-        self._gravity = math.nan
+        self.gravity = math.nan
         if self._with_force >= _SOME:
             up, down = self._force_in_map, np.asarray(config.gravity_in_map, float)
             cosine = -(up @ down) / max(float(np.linalg.norm(up) * np.linalg.norm(down)), 1e-12)
-            self._gravity = math.acos(min(max(cosine, -1.0), 1.0))
+            self.gravity = math.acos(min(max(cosine, -1.0), 1.0))
 
     def _wanted(self, config: NodeConfig) -> bool:
         return config.imu.use != ImuUse.NONE and self.frame != ""
@@ -281,8 +262,8 @@ class AidInput:
             self._in_a_row.clear()
             self._reported = None
             return
-        self._reasons[unused.reason] += 1
-        self._details[unused.reason] = unused.detail
+        self.reasons[unused.reason] += 1
+        self.details[unused.reason] = unused.detail
         self._in_a_row.append(unused.reason)
         if self._in_a_row.count(unused.reason) == _LONG and self._reported != unused.reason:
             self._reported = unused.reason

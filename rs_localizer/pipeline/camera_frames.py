@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rs_localizer import matching
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -138,7 +137,7 @@ class CameraFrames(FrameLocalizer):
             return by
         if (cloud := self.landmarks.repeated(keypoints)) is not None:
             return self._delayed(self._localize(cloud), keypoints.stamp_ns)
-        if by == matching.MatchBy.DESCRIPTOR:
+        if by == "descriptor":
             time_ns = self._middle_row_ns(keypoints.stamp_ns)
             if self.landmarks.map is not None:
                 self._expect(time_ns, self.landmarks.map.frame)

@@ -135,8 +135,7 @@ class FrameLocalizer(ABC):
 
     def describe(self) -> tuple[dict[str, str], dict[str, str]]:
         """Return values for people, and what is odd, by readable names."""
-        state, watch = self.aid.state, self.tracker.shutter
-        values, odd = ({}, {}) if state is None else (state.values(), state.oddities())
+        watch, values, odd = self.tracker.shutter, self.aid.values(), self.aid.oddities()
         if watch.fault:
             odd["readout_time"] = watch.fault
         if (seen := watch.measured) is not None:

@@ -20,8 +20,10 @@ from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.messages import MessageError, stamp_ns
+from rs_localizer.io.outputs import BodyPose
 from rs_localizer.io.transforms import Transform, TransformError, from_numbers
 from rs_localizer.pipeline.aid import Moment
+from rs_localizer.pipeline.published import base_pose
 from rs_localizer.pipeline.refusal import Notify
 
 # Deviations (m, rad) that a variance of zero stands for: RViz leaves z, roll and pitch at zero.
@@ -152,18 +154,15 @@ def _of_camera(
     given: GivenPose, body_from_camera: Transform, seconds: float, config: NodeConfig
 ) -> Prior:
     """Return the prior of a camera that may have moved for this long, as cameras do."""
-    camera = given.pose @ body_from_camera
     pace = [config.velocity_prior.linear, config.velocity_prior.angular]
     moved = np.repeat(np.square(np.multiply(pace, seconds)), 3)
     covariance = given.allowed + np.diag(moved)
-    # Turn and place of the camera in its own axes, by those of the body about the map's.
-    back = camera.rotation.T
-    lever = camera.translation - given.pose.translation
-    jacobian = np.zeros((6, 6))
-    jacobian[:3, 3:] = back
-    jacobian[3:, :3] = back
-    jacobian[3:, 3:] = -back @ so3.hat(lever)
-    spread = jacobian @ covariance @ jacobian.T
+    body = BodyPose(given.pose.translation, given.pose.rotation, covariance)
+    camera = base_pose(body, body_from_camera)
+    # Turn and place of the camera in its own axes, by those about the axes of the map.
+    back, jacobian = camera.rotation.T, np.zeros((6, 6))
+    jacobian[:3, 3:] = jacobian[3:, :3] = back
+    spread = jacobian @ camera.covariance @ jacobian.T
     # Of numbers that are known to a metre and to a thousand kilometres rounding may leave none.
     scale = np.sqrt(spread.diagonal())
     values, vectors = np.linalg.eigh(spread / np.outer(scale, scale))
@@ -173,5 +172,5 @@ def _of_camera(
     for i, deviation in ((6, config.velocity_prior.angular), (9, config.velocity_prior.linear)):
         variance = (deviation * readout) ** 2 if deviation > 0.0 else np.inf
         whole[i : i + 3, i : i + 3][np.diag_indices(3)] = variance
-    motion = Motion(back, -back @ camera.translation, np.zeros(3), np.zeros(3))
+    motion = Motion(back, -back @ camera.position, np.zeros(3), np.zeros(3))
     return Prior(motion=motion, covariance=whole)

@@ -60,7 +60,7 @@ class Input:
     """
 
     topic: str  # relative to the node's namespace; also the name of the input
-    type: str  # of its messages
+    types: tuple[str, ...]  # of its messages, with the same names of fields
     about: str  # what they hold
     role: Role
     use: Callable[[Any, Any], Results]
@@ -72,12 +72,6 @@ class Input:
     needs: str = ""  # of frames: the input that has to come first, and that only they use
     latched: bool = False  # who comes late wants the last message, too
     lasting: bool = False  # one message is enough
-    also: tuple[str, ...] = ()  # other types with the same names of fields; none may be installed
-
-    @property
-    def types(self) -> tuple[str, ...]:
-        """All types of its messages."""
-        return self.type, *self.also
 
     @property
     def option(self) -> str:
@@ -99,32 +93,32 @@ class Input:
 # fmt: off
 _ROWS = (
     Input(
-        topics.CAMERA_INFO, CAMERA_INFO_TYPE, "the camera's calibration", Role.STATE,
+        topics.CAMERA_INFO, (CAMERA_INFO_TYPE,), "the camera's calibration", Role.STATE,
         lambda localizer, calibration: localizer.calibrate(calibration), Reason.BAD_CAMERA_INFO,
         read=read_camera_info, in_words="camera_info", necessary=True, latched=True,
     ),
     Input(
-        topics.MAP_POINTS, CLOUD_TYPE, "the map for keypoints, latched", Role.STATE,
+        topics.MAP_POINTS, (CLOUD_TYPE,), "the map for keypoints, latched", Role.STATE,
         lambda localizer, landmarks: localizer.landmarks.use_map(landmarks), Reason.BAD_MAP,
         read=read_map, in_words="a map", latched=True, lasting=True,
     ),
     Input(
-        topics.IMU, IMU_TYPE, "the IMU beside the camera", Role.SAMPLES,
+        topics.IMU, (IMU_TYPE,), "the IMU beside the camera", Role.SAMPLES,
         lambda localizer, reading: localizer.aid.add(reading), Reason.BAD_IMU, read=read_imu,
     ),
     Input(
-        topics.CORRESPONDENCES, CLOUD_TYPE, "points of the map and their pixels", Role.FRAMES,
+        topics.CORRESPONDENCES, (CLOUD_TYPE,), "points of the map and their pixels", Role.FRAMES,
         lambda localizer, message: localizer.localize(message), Reason.BAD_CLOUD,
     ),
     Input(
-        topics.KEYPOINTS, CLOUD_TYPE, "pixels with ids or descriptors, to be matched", Role.FRAMES,
-        lambda localizer, message: localizer.localize_keypoints(message), Reason.BAD_KEYPOINTS,
-        needs=topics.MAP_POINTS,
+        topics.KEYPOINTS, (CLOUD_TYPE,), "pixels with ids or descriptors, to be matched",
+        Role.FRAMES, lambda localizer, message: localizer.localize_keypoints(message),
+        Reason.BAD_KEYPOINTS, needs=topics.MAP_POINTS,
     ),
     Input(
-        topics.DETECTIONS, APRILTAG_TYPE, "tags of another detector, with marker_map", Role.FRAMES,
-        lambda localizer, message: localizer.localize_detections(message), Reason.BAD_DETECTIONS,
-        also=(ISAAC_TYPE,),
+        topics.DETECTIONS, (APRILTAG_TYPE, ISAAC_TYPE), "tags of another detector, with marker_map",
+        Role.FRAMES, lambda localizer, message: localizer.localize_detections(message),
+        Reason.BAD_DETECTIONS,
     ),
 )
 # fmt: on

@@ -2,20 +2,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """The map that keypoints are matched with."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rs_localizer import matching
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.clouds import Correspondences, Keypoints
 from rs_localizer.io.maps.landmarks import Map, MapError
-from rs_localizer.matching import MOST_KEYPOINTS, MatchBy, Matcher, MatchError
 from rs_localizer.pipeline.refusal import Notify, Refusal
+
+if TYPE_CHECKING:  # without a map nobody needs it
+    from rs_localizer.matching import MatchBy, Matcher
 
 
 class Landmarks:
@@ -55,6 +59,8 @@ class Landmarks:
                 f"a map of {len(landmarks)} landmarks in frame {landmarks.frame!r} replaces the "
                 f"one of {len(previous)} in frame {previous.frame!r}",
             )
+        from rs_localizer.matching import Matcher
+
         self._matcher, self._last = Matcher(landmarks), None
         modes = landmarks.error_modes
         self.error_modes = None if modes is None else ErrorModes(landmarks.points, modes)
@@ -67,6 +73,8 @@ class Landmarks:
             return Refusal(
                 Reason.NO_MAP, "no usable map has come yet, on map_points or as map_file"
             )
+        from rs_localizer.matching import MOST_KEYPOINTS, MatchBy, MatchError
+
         try:
             by = self._matcher.choose(keypoints)
         except MatchError as error:
@@ -90,7 +98,9 @@ class Landmarks:
                 f"none of {len(keypoints)} keypoints matches one of {len(self._matcher.map)} "
                 f"landmarks by {matches.by}",
             )
-        found = matching.correspondences(matches, keypoints, self._matcher.map)
+        from rs_localizer.matching import correspondences
+
+        found = correspondences(matches, keypoints, self._matcher.map)
         self._last = keypoints, found
         return found
 

@@ -8,12 +8,10 @@ The node and the offline ``rs_localizer detect --features`` run this one class.
 from typing import Any, NamedTuple
 
 from rs_localizer.config import FeatureConfig
-from rs_localizer.core.reasons import Reason
 from rs_localizer.features.extraction import FeatureExtractor, Features
 from rs_localizer.io.clouds import make_cloud, make_rows
-from rs_localizer.io.images import Image, read_image
+from rs_localizer.io.images import Image
 from rs_localizer.io.messages import Make
-from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
 
 
 class Extracted(NamedTuple):
@@ -47,11 +45,6 @@ class FrameExtractor:
         self.described = f"{config.features}, at most {config.max_keypoints} keypoints an image"
         self._extractor = FeatureExtractor(config.features, config.max_keypoints)
 
-    def take(self, message: Any) -> Extracted | Refusal:
-        """Look for keypoints in a sensor_msgs/Image or CompressedImage."""
-        image = read_or_refuse(read_image, message, Reason.BAD_IMAGE)
-        return image if isinstance(image, Refusal) else self.extract(image)
-
-    def extract(self, image: Image) -> Extracted:
+    def detect(self, image: Image) -> Extracted:
         """Look for keypoints in an image."""
         return Extracted(image, self._extractor.extract(image.pixels))

@@ -11,14 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rs_localizer.config import DetectorConfig
-from rs_localizer.core.reasons import Notice, Reason
+from rs_localizer.core.reasons import Notice
 from rs_localizer.io.clouds import make_cloud, make_rows, point_fields
-from rs_localizer.io.images import Image, read_image
+from rs_localizer.io.images import Image
 from rs_localizer.io.messages import Make
 from rs_localizer.markers.detection import Detections, MarkerDetector
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
-from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unheard
+from rs_localizer.pipeline.refusal import Notify, unheard
 from rs_localizer.pipeline.tags import listed
 from rs_localizer.pipeline.what_fits import Mistakes
 
@@ -76,11 +76,6 @@ class FrameDetector:
         # Fault of all images, as a sentence; empty: unknown.
         self.mistake = ""
         self._mistakes = Mistakes()
-
-    def take(self, message: Any) -> Detected | Refusal:
-        """Look for markers in a sensor_msgs/Image or CompressedImage."""
-        image = read_or_refuse(read_image, message, Reason.BAD_IMAGE)
-        return image if isinstance(image, Refusal) else self.detect(image)
 
     def detect(self, image: Image) -> Detected:
         """Look for markers in an image."""

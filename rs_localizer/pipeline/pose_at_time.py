@@ -2,27 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pose and twist of the body at one moment of a motion, with covariances in REP-103's order.
 
-The estimate is centred on the middle row and counts time in readouts. A published pose holds at one
-moment, in SI units, and its covariance has the order of REP-103. Errors are propagated to first
-order. ``R = map_from_camera`` and ``c``, the camera centre, are at ``tau = 0``; the rotation since
-then is ``theta = tau omega + tau^2/2 alpha``, the way ``w = tau v + tau^2/2 a``. The estimate's
-errors in its own order are ``phi, rho, d_omega, d_v, d_alpha, d_a``:
-
-    rotation(tau) = R exp(phi) exp(theta + d_theta)
-                  = exp(R (phi + J(theta) d_theta)) R exp(theta)
-    centre(tau)   = c + R rho + R exp(phi) (w + d_w)
-                  = c + R w + R (rho - [w]x phi + d_w)
-    v(tau)        = exp(-theta - d_theta) (u + d_u),   u = v + tau a
-                  = E u + E d_u + [E u]x J(-theta) d_theta,   E = exp(-theta)
-    omega(tau)    = J(-theta) (omega + tau alpha)
-                  = omega + tau/2 (I + J(-theta)) alpha + ...
-
-where J is the left Jacobian of SO(3): ``exp(a + d) = exp(J(a) d) exp(a)``; it is the right one of
-``-a``. Without acceleration the body rate is ``omega`` at any time; second orders of the
-acceleration are left out.
-
-Vibration rotates the camera by ``delta(tau)`` in its own axes beside this motion. Its coefficients
-stand behind the motion in the estimate's covariance, and its rotation and rate are linear in them.
+The estimate is centred on the middle row and counts time in readouts; :meth:`.Estimate.moved_to`
+carries it to another row time. A published pose is in SI units, and its covariance has the order of
+REP-103.
 """
 
 from dataclasses import replace
@@ -31,12 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.config import Acceleration, NodeConfig, PoseTime
-from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.moment_kernels import pose_of, twist_of
-from rs_localizer.core.shutter import Numbers, numbers_of
-from rs_localizer.core.state import MOTION_PARAMETERS
-from rs_localizer.core.types import Estimate, beyond_rows
+from rs_localizer.core.state import ANGULAR, LINEAR, MOVE, POSE, TURN
+from rs_localizer.core.types import Estimate
 from rs_localizer.io.outputs import BodyPose, Twist
 from rs_localizer.shutter_watch import ShutterWatch
 from rs_localizer.solvers.table import SOLVERS
@@ -52,27 +31,22 @@ class PublishedMoment(NamedTuple):
 
 def pose_at(estimate: Estimate, tau: float) -> BodyPose:
     """Return the pose of the camera in the map at row time ``tau``."""
-    position, rotation, covariance = pose_of(
-        *_numbers(estimate, tau), beyond_rows(estimate, tau)[0]
-    )
-    return BodyPose(position=position, rotation=rotation, covariance=covariance)
+    there = estimate.moved_to(tau) if tau else estimate
+    map_from_camera, jacobian = there.rotation.T, np.zeros((6, 6))
+    jacobian[:3, MOVE] = jacobian[3:, TURN] = map_from_camera
+    covariance = jacobian @ there.covariance[POSE, POSE] @ jacobian.T
+    return BodyPose(there.position, map_from_camera, 0.5 * (covariance + covariance.T))
 
 
 def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
     """Return the twist at row time ``tau``, in camera axes then; readout_time in s."""
-    linear, angular, covariance = twist_of(*_numbers(estimate, tau), beyond_rows(estimate, tau))
+    there = estimate.moved_to(tau) if tau else estimate
+    order = np.r_[LINEAR, ANGULAR]
+    covariance = there.covariance[np.ix_(order, order)] / readout_time**2
     return Twist(
-        linear=linear / readout_time,
-        angular=angular / readout_time,
-        covariance=covariance / readout_time**2,
-    )
-
-
-def _numbers(estimate: Estimate, tau: float) -> tuple[Numbers, Array, Array, float]:
-    """Return the numbers of an estimate at a row time, as kernels take them."""
-    joint = np.ascontiguousarray(estimate.joint_covariance.copy())
-    joint[:MOTION_PARAMETERS, :MOTION_PARAMETERS] = estimate.covariance
-    return numbers_of(estimate), np.ascontiguousarray(estimate.shake), joint, float(tau)
+        there.linear_velocity / readout_time, there.angular_velocity / readout_time,
+        0.5 * (covariance + covariance.T),
+    )  # fmt: skip
 
 
 def with_timing(
@@ -113,9 +87,9 @@ def published_motion(
     readout_time, (_, tau, there) = estimate.span, moment
     moving = readout_time > 0.0 and SOLVERS[config.solver].rolling_shutter
     moving = moving and (estimate.aided or not watch.is_global)
-    motion, at = (estimate, tau) if there is None else (there, 0.0)
-    pose = pose_at(motion, at)
-    twist = twist_at(motion, at, readout_time) if moving else None
+    there = there or (estimate.moved_to(tau) if tau else estimate)
+    pose = pose_at(there, 0.0)
+    twist = twist_at(there, 0.0, readout_time) if moving else None
     deviation = 0.0 if config.of_cameras else config.readout_time_deviation
     late = max(deviation, watch.error)
     if twist is not None and late > 0.0:

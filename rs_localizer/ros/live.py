@@ -24,8 +24,7 @@ from rs_localizer.ros.node.statistics import Event
 from rs_localizer.settings import NODE_NAME
 
 _UNANSWERED = Event.REFUSED, Event.REPLACED, Event.DROPPED
-# s after which a frame is sent again, because it was lost, and after which there is no answer.
-_AGAIN, _TOO_LONG = 5.0, 60.0
+_TOO_LONG = 60.0  # s after which there is no answer
 _SETTLING = 1.0  # s for endpoints to find each other both ways
 
 
@@ -85,18 +84,11 @@ class LiveNode:
         Raises:
             ValueError: when there is none.
         """
-        stamp, before, sent = stamp_ns(cloud), self._unanswered, float("-inf")
-
-        def answered() -> bool:
-            nonlocal sent
-            if time.monotonic() > sent + _AGAIN:
-                sent = time.monotonic()
-                to_info, to_cloud = self._publishers
-                to_info.publish(copy_message(info, "sensor_msgs/msg/CameraInfo"))
-                to_cloud.publish(copy_message(cloud, "sensor_msgs/msg/PointCloud2"))
-            return stamp in self._poses or self._unanswered > before
-
-        self._until(answered)
+        stamp, before = stamp_ns(cloud), self._unanswered
+        to_info, to_cloud = self._publishers
+        to_info.publish(copy_message(info, "sensor_msgs/msg/CameraInfo"))
+        to_cloud.publish(copy_message(cloud, "sensor_msgs/msg/PointCloud2"))
+        self._until(lambda: stamp in self._poses or self._unanswered > before)
         return self._poses.get(stamp)
 
     @property

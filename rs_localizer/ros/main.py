@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executables: take signals in hand, then import what takes long."""
 
+import argparse
 import importlib
 import sys
 from collections.abc import Sequence
@@ -12,7 +13,6 @@ from rs_localizer.process import ignore_working_folder, limit_threads
 from rs_localizer.process.missing import explain
 from rs_localizer.process.stopping import StopRequest
 
-_HELP, _VERSION = ("-h", "--help"), ("--version",)
 _ROS_ARGUMENTS, _END_OF_THEM = "--ros-args", "--"  # what is between them is for ROS
 
 # For each executable, the class of its node or its function below rs_localizer.ros, the name of a
@@ -29,57 +29,46 @@ _PROGRAMS = {
 }  # fmt: skip
 
 
-class CommandLineError(Exception):
-    """Some argument is neither for ROS nor known."""
-
-
-def answer(name: str, words: Sequence[str]) -> str | None:
-    """Return the text that is asked for; None if a program is to start.
+def check_words(name: str, words: Sequence[str]) -> None:
+    """Answer a question of the command line, or refuse it: both end the process.
 
     Args:
         name: of the executable.
         words: arguments of the command line.
 
     Raises:
-        CommandLineError: an argument is neither for ROS nor known.
+        SystemExit: for ``--help``, ``--version``, and arguments that are neither for ROS nor known.
     """
     own, for_ros = [], False
     for word in words:
         for_ros = word == _ROS_ARGUMENTS or (for_ros and word != _END_OF_THEM)
         if not for_ros and word != _END_OF_THEM:
             own.append(word)
-    if any(word in _VERSION for word in own):
-        return f"rs_localizer {rs_localizer.__version__}\n"
-    if any(word in _HELP for word in own):
-        return _help(name)
-    if own:
-        raise CommandLineError(
-            f"unknown arguments: {' '.join(own)}. Parameters and remappings follow "
-            f"{_ROS_ARGUMENTS}: see ros2 run rs_localizer {name} --help"
-        )
-    return None
-
-
-def _help(name: str) -> str:
+    if not own:
+        return
     _, node, about = _PROGRAMS[name]
-    lines = [
-        f"usage: ros2 run rs_localizer {name} --ros-args [-p NAME:=VALUE] [--params-file FILE]",
-        "",
-        f"{about} It ends with Ctrl-C.",
-        "The commands that need no ROS: rs_localizer --help.",
-    ]
-    if not node:
-        return "\n".join(lines) + "\n"
+    parser = argparse.ArgumentParser(
+        f"ros2 run rs_localizer {name}",
+        f"%(prog)s {_ROS_ARGUMENTS} [-p NAME:=VALUE] [--params-file FILE]",
+        f"{about} It ends with Ctrl-C. The commands that need no ROS: rs_localizer --help.",
+        _parameters(node) if node else None,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    version = f"rs_localizer {rs_localizer.__version__}"
+    parser.add_argument("--version", action="version", version=version)
+    parser.parse_args(own)
+
+
+def _parameters(node: str) -> str:
     from rs_localizer.settings import NODES, settings
 
     (kind,) = (kind for kind, node_name in NODES.items() if node_name == node)
-    lines += ["", "parameters (name: default):"]
+    lines = ["parameters (name: default):"]
     for setting_name, one in settings(kind).items():
         default = one.default if one.default != "" else '""'
-        lines.append(f"  {setting_name}: {default}")
         choices = f" ({', '.join(one.choices)})" if one.choices else ""
-        lines.append(f"      {one.description}{choices}")
-    return "\n".join(lines) + "\n"
+        lines += [f"  {setting_name}: {default}", f"      {one.description}{choices}"]
+    return "\n".join(lines).replace("%", "%%")
 
 
 def _run(name: str, args: list[str] | None = None) -> int:
@@ -88,10 +77,7 @@ def _run(name: str, args: list[str] | None = None) -> int:
     with StopRequest() as stop:
         try:
             with stop.at_once():
-                text = answer(name, sys.argv[1:] if args is None else args)
-                if text is not None:
-                    sys.stdout.write(text)
-                    return 0
+                check_words(name, sys.argv[1:] if args is None else args)
                 # The imports that follow take long.
                 path, node, _ = _PROGRAMS[name]
                 module, _, kind = path.rpartition(".")
@@ -103,9 +89,6 @@ def _run(name: str, args: list[str] | None = None) -> int:
         except ImportError as error:
             sys.stderr.write(f"{name}: {explain(error)}\n")
             return 1
-        except CommandLineError as error:
-            sys.stderr.write(f"{name}: {error}\n")
-            return 2
         code: int = make(stop, args)
         return code
 

@@ -19,6 +19,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences, read_keypoints
+from rs_localizer.io.images import read_image
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.io.trajectories import read_motions
 from rs_localizer.markers.dictionaries import pattern
@@ -166,7 +167,7 @@ def test_bag_of_markers(here, capsys):
     assert settings(here)["readout_time"] == 0.02
     # The same bits as the node's own code makes of the message.
     detector = FrameDetector(DetectorConfig(marker_map=here.map[1]))
-    node = correspondences(detector.take(messages[0]), make_message)
+    node = correspondences(detector.detect(read_image(messages[0])), make_message)
     assert bytes(node.data) == bytes(topic(here.out, "/correspondences")[0].data)
 
 
@@ -184,7 +185,7 @@ def test_keypoints_of_anything(here, kind, width, capsys):
     extractor = FrameExtractor(FeatureConfig(features=kind, max_keypoints=40))
     found = topic(here.out, "/keypoints")
     for message, cloud in zip([messages[k] for k in (0, 2, 3)], found, strict=True):
-        live = keypoints(extractor.take(message), make_message)
+        live = keypoints(extractor.detect(read_image(message)), make_message)
         assert bytes(cloud.data) == bytes(live.data)
         assert repr((cloud.header, cloud.fields)) == repr((live.header, live.fields))
         descriptors = read_keypoints(cloud).descriptors

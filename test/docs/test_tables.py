@@ -105,10 +105,10 @@ def test_the_topics_of_the_localizer():
     of_node: Any = LocalizerNode.topics(Mock(), NodeConfig())
     taken = {name: topic.type for name, topic in of_node.items()}
     # Their packages are not installed everywhere; the node then does without.
-    optional = {name: item for name, item in INPUTS.items() if item.also}
+    optional = {name: item for name, item in INPUTS.items() if len(item.types) > 1}
     assert {name for name, (way, _) in said.items() if way == "in"} == {*taken, *optional}
     for name, item in optional.items():
-        assert said[name][1] == item.type.replace("/msg/", "/")
+        assert said[name][1] == item.types[0].replace("/msg/", "/")
     for name, kind in taken.items():
         assert said[name][1] == f"{kind.__module__.split('.')[0]}/{kind.__name__}"
     sent = {

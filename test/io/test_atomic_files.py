@@ -15,7 +15,6 @@ from rs_localizer.io.atomic_files import (
     atomic_directory,
     atomic_files,
     content,
-    remove_unfinished,
 )
 
 
@@ -175,5 +174,3 @@ def test_who_was_killed_blocks_nothing(tmp_path, old):
     write_directory(tmp_path)
     assert content(place) == ["folder", "more", "same"]
     assert {name: (place / name).read_text() for name in NEW} == NEW
-    remove_unfinished(left[0].parent)
-    assert not list(tmp_path.rglob(".unfinished-*"))

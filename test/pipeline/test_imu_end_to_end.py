@@ -99,8 +99,7 @@ def test_pose_and_twist_are_right_whatever_is_turned_or_late(scan, stamp_offset,
             off.append(errors(found))
         # The readings go on for 150 ms.
         ahead.append(errors(localizer.at(frames.middle_ns(k) + 90_000_000)))
-    assert localizer.aid.state is not None
-    assert localizer.aid.state.share > 0.8
+    assert localizer.aid.share > 0.8
     orientation, metres, angular, linear = np.median(off[SETTLED:], axis=0)[:4]
     assert np.degrees(orientation) < 0.1
     assert metres < 0.003

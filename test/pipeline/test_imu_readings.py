@@ -102,7 +102,7 @@ class Flown:
                 localizer.aid.add(read_imu(message))
             else:
                 self.results.append(localizer.localize(message))
-        self.state: Any = localizer.aid.state
+        self.aid = localizer.aid
 
     def errors(self) -> Any:
         """Degrees and metres (n,2) of each frame, and their largest deviations (n,2)."""
@@ -134,9 +134,9 @@ def later(message: Any, seconds: float) -> Any:
 def test_it_makes_poses_better(flight):
     both, alone = Flown(flight), Flown(flight, lambda message, time: ())
     both.assert_none_is_lost_or_wrong()
-    assert both.state.share > 0.95  # one frame in a thousand contradicts it by chance
-    assert both.state.rate == pytest.approx(400.0)
-    assert alone.state is None  # whoever has no IMU hears nothing of it
+    assert both.aid.share > 0.95  # one frame in a thousand contradicts it by chance
+    assert both.aid.values()["IMU rate (Hz)"] == "400.0"
+    assert alone.aid.values() == {}  # whoever has no IMU hears nothing of it
     assert np.median(both.errors()[0][:, 0]) < 0.75 * np.median(alone.errors()[0][:, 0])
     # An IMU that is not used changes nothing, to the last bit.
     for other in Flown(flight, config=WITHOUT, most=30), Flown(flight, mounting=False, most=30):
@@ -165,10 +165,10 @@ def test_the_camera_goes_on_alone(flight, fault):
     change, reason = FAULTS[fault]
     flown = Flown(flight, change)
     flown.assert_none_is_lost_or_wrong()
-    assert flown.state.reasons[reason] > 0
+    assert flown.aid.reasons[reason] > 0
     lasts = fault not in ("is cut", "begins late")
     assert flown.notices[reason] == lasts  # told once, not at every frame
-    told = summary(Tally(0, {}, aid=flown.state), NodeConfig(), Path("out"), timed=False)
+    told = summary(Tally(0, {}, aid=flown.aid), NodeConfig(), Path("out"), timed=False)
     assert any(line.startswith(f"{reason}: ") for line in told)
 
 
@@ -180,10 +180,10 @@ def test_a_wrong_mounting_is_noticed(flight):
     rotation.x, rotation.y, rotation.z, rotation.w = wrong.as_quat().tolist()
     flown = Flown(flight, mounting=upside_down)
     flown.assert_none_is_lost_or_wrong()
-    assert flown.state.mostly.reason == ImuReason.DISAGREES
+    assert flown.aid.mostly.reason == ImuReason.DISAGREES
     words = "the camera's x y z are its -x -y z"
     assert f"the gyroscope is not used: {words}" in flown.said
-    assert flown.state.values()["IMU contradicted by the camera"] == words
+    assert flown.aid.values()["IMU contradicted by the camera"] == words
 
 
 @pytest.mark.parametrize(("down", "degrees"), [((0.0, 0.0, -1.0), 0.0), ((0.0, 1.0, 0.0), 90.0)])
@@ -191,7 +191,7 @@ def test_gravity_is_compared_with_the_map(flight, down, degrees):
     imu = Imu(gravity=True)
     config = NodeConfig(readout_time=READOUT_TIME, imu=imu, gravity_in_map=down)
     flown = Flown(flight, config=config)
-    assert math.degrees(flown.state.gravity) == pytest.approx(degrees, abs=5.0)
+    assert math.degrees(flown.aid.gravity) == pytest.approx(degrees, abs=5.0)
 
 
 def test_without_a_readout_time_or_for_a_global_shutter_it_is_not_used_and_that_is_told(flight):
@@ -200,7 +200,7 @@ def test_without_a_readout_time_or_for_a_global_shutter_it_is_not_used_and_that_
         (NodeConfig(readout_time=READOUT_TIME, solver="p3p"), ImuReason.NOT_TRACKING),
     ):
         flown = Flown(flight, config=config, most=8)
-        assert flown.state.mostly.reason == reason
+        assert flown.aid.mostly.reason == reason
         assert flown.notices[reason] == 1
 
 

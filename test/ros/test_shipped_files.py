@@ -271,13 +271,13 @@ def test_robot_localization_listens_to_what_the_node_publishes():
     assert found["world_frame"] == found["map_frame"]
 
 
-def test_only_what_is_for_ros_is_handed_on():
+def test_only_what_is_for_ros_is_handed_on(capsys):
     for words in ("", "--ros-args -r imu:=/imu --log-level debug", "--ros-args -p a:=1 --"):
-        assert main.answer("localizer", words.split()) is None
-    assert "usage" in str(main.answer("localizer", ["--ros-args", "-p", "a:=1", "--", "--help"]))
-    for words in ("--badarg", "imu:=/imu", "--ros-args -p a:=1 -- --badarg"):
-        with pytest.raises(
-            main.CommandLineError, match=f"unknown arguments: {words.split()[-1]}. Param"
-        ):
-            main.answer("localizer", words.split())
-    assert main.main(["--badarg"]) == 2
+        main.check_words("localizer", words.split())
+    for words, code in (("--badarg", 2), ("imu:=/imu", 2), ("--ros-args -p a:=1 -- --help", 0)):
+        with pytest.raises(SystemExit) as end:
+            main.main(words.split())
+        assert end.value.code == code
+        said = capsys.readouterr()
+        assert "localizer --ros-args [-p NAME:=VALUE]" in said.out + said.err
+        assert words.split()[-1] in said.out + said.err

@@ -160,21 +160,22 @@ def _line(values: Array | list[float]) -> str:
 DATABASE = "database.db"
 
 
-def read_colmap(folder: Path, frame: str, database: Path | None = None) -> Map:
+def read_colmap(folder: Path, frame: str) -> Map:
     """Read the landmarks of a model.
+
+    Their descriptors are in ``database.db`` in the folder or in one of the two above it, where
+    COLMAP leaves it; without one the map has none.
 
     Args:
         folder: of the model.
         frame: of the model.
-        database: default: ``database.db`` in the folder or in one of the two above it, where
-            COLMAP leaves it; without one the map has no descriptors.
 
     Raises:
         MapError: for anything that is no model.
         ImportError: without pycolmap.
     """
     places = (place / DATABASE for place in (folder, *folder.resolve().parents[:2]))
-    model = read_model(folder, database or next(filter(Path.is_file, places), None))
+    model = read_model(folder, next(filter(Path.is_file, places), None))
     usable = model.described
     landmarks = make_map(model.points[usable], model.ids[usable], model.descriptors, frame)
     return replace(landmarks, dropped=landmarks.dropped + int(np.count_nonzero(~usable)))

@@ -52,13 +52,12 @@ def write_npz(path: Path, landmarks: Map) -> None:
         np.savez(file, **{name: array for name, array in arrays.items() if array is not None})
 
 
-def read_map_file(path: Path | str, frame: str, database: Path | None = None) -> Map:
+def read_map_file(path: Path | str, frame: str) -> Map:
     """Read a map: a folder of COLMAP or a NumPy archive (.npz).
 
     Args:
         path: of the file or folder.
         frame: in which its points are given; files do not say.
-        database: COLMAP's, where it is not near the model.
 
     Raises:
         MapError: for anything that is no map, naming the file and what was found.
@@ -68,11 +67,9 @@ def read_map_file(path: Path | str, frame: str, database: Path | None = None) ->
     file.stat()  # what does not exist is said to be so
     try:
         if file.is_dir():
-            return read_colmap(file, frame, database)
+            return read_colmap(file, frame)
         if not file.is_file():
             raise MapError("it is no plain file: a pipe or device may have no end")
-        if database is not None:
-            raise MapError("it is not a folder of COLMAP, which alone has a database")
         with file.open("rb") as opened, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # NumPy warns of old headers
             arrays = {"ids": None, "descriptors": None} | _arrays(opened)

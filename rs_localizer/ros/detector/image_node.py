@@ -16,10 +16,12 @@ from sensor_msgs.msg import CompressedImage, PointCloud2
 from sensor_msgs.msg import Image as ImageMessage
 
 from rs_localizer.config import DetectorConfig, FeatureConfig, ImageTransport
-from rs_localizer.core.reasons import Notice
+from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.io import topics
+from rs_localizer.io.images import read_image
 from rs_localizer.io.messages import Make, make_header
 from rs_localizer.io.topics import COMPRESSED_IMAGE, IMAGE
+from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
 from rs_localizer.ros.node.conversion import create_output, make_message, steady_timer
 from rs_localizer.ros.node.diagnostics import (
     Health,
@@ -84,7 +86,14 @@ class ImageNode(ManagedNode[Settings, Result], Generic[Settings, Result]):
             create_output(self, PointCloud2, self.output),
             create_output(self, ImageMessage, f"~/{topics.DEBUG_IMAGE}"),
         )
-        self.employ(lambda _, image: self._finder.take(image), self._publish)
+        self.employ(self._look_at, self._publish)
+
+    def _look_at(self, topic: str, message: Any) -> Result | Refusal:
+        """Look for what the node looks for, in the worker's thread."""
+        image = read_or_refuse(read_image, message, Reason.BAD_IMAGE)
+        found: Result | Refusal
+        found = image if isinstance(image, Refusal) else self._finder.detect(image)
+        return found
 
     def use_finder(self, finder: Any) -> None:
         """Look at the next images with this one."""
@@ -108,9 +117,13 @@ class ImageNode(ManagedNode[Settings, Result], Generic[Settings, Result]):
         if clouds.get_subscription_count():
             clouds.publish(self.make_cloud(result, make_message))
         if pictures.get_subscription_count():
-            image = result.image
-            header = make_header(make_message, image.stamp_ns, image.frame)
-            pictures.publish(_raw(header, self.draw(result)))
+            header = make_header(make_message, result.image.stamp_ns, result.image.frame)
+            picture = self.draw(result)
+            height, width, _ = picture.shape
+            pictures.publish(make_message(
+                "sensor_msgs/msg/Image", header=header, height=height, width=width,
+                encoding="bgr8", is_bigendian=0, step=3 * width, data=picture.ravel(),
+            ))  # fmt: skip
 
     def examine(self) -> tuple[Health, str]:
         summary = self.statistics.summary()
@@ -160,17 +173,3 @@ class ImageNode(ManagedNode[Settings, Result], Generic[Settings, Result]):
             if self.count_publishers(self.resolve_topic_name(topic)):
                 return topic
         return self._listening[-1] if self._listening else IMAGE
-
-
-def _raw(header: Any, picture: Picture) -> Any:
-    height, width, _ = picture.shape
-    return make_message(
-        "sensor_msgs/msg/Image",
-        header=header,
-        height=height,
-        width=width,
-        encoding="bgr8",
-        is_bigendian=0,
-        step=3 * width,
-        data=picture.ravel(),
-    )

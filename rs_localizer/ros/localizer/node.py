@@ -35,14 +35,8 @@ from rs_localizer.ros.localizer.health import (
     of_interest,
     tell,
 )
+from rs_localizer.ros.node import conversion
 from rs_localizer.ros.node.clock import watch_clock
-from rs_localizer.ros.node.conversion import (
-    create_output,
-    installed,
-    make_message,
-    message_class,
-    steady_timer,
-)
 from rs_localizer.ros.node.diagnostics import Health
 from rs_localizer.ros.node.managed import ManagedNode
 from rs_localizer.ros.node.statistics import WINDOW
@@ -74,8 +68,8 @@ class Publisher:
     def __init__(self, node: Any, frames: FrameLocalizer, broadcaster: Broadcaster) -> None:
         self._node, self._frames, self._broadcaster = node, frames, broadcaster
         self._publishers = {
-            name: create_output(
-                node, message_class(kind), f"~/{name}", overridable=name == topics.POSE
+            name: conversion.create_output(
+                node, conversion.message_class(kind), f"~/{name}", overridable=name == topics.POSE
             )
             for name, kind in (TYPES | topics.LIVE).items()
             if name not in (topics.MAP_MARKERS, topics.MAP_TO_ODOM)  # others publish them
@@ -123,7 +117,7 @@ class Publisher:
     def _send(self, frame: Localized, names: Collection[str]) -> None:
         """Publish those of these outputs that have subscribers."""
         wanted = list(filter(self._wanted, names))
-        for name, message in messages(frame, make_message, wanted).items():
+        for name, message in messages(frame, conversion.make_message, wanted).items():
             self._publishers[name].publish(message)
 
 
@@ -197,7 +191,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
             self.destroy_timer(self._ticks)
         self._ticks = None
         if rate > 0.0 and self._publisher is not None:
-            self._ticks = steady_timer(self, 1.0 / rate, self._publisher.publish_motion)
+            self._ticks = conversion.steady_timer(self, 1.0 / rate, self._publisher.publish_motion)
 
     def _time_jumped(self, seconds: float) -> None:
         self._broadcaster.jumped(seconds)
@@ -226,7 +220,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         found = {}
         for name, item in inputs_of(config).items():
             qos = FAST_DATA if item.role is Role.SAMPLES else SENSOR_DATA
-            kind = installed(*item.types)
+            kind = conversion.installed(*item.types)
             if kind is not None:  # some are of packages that most do not have
                 found[name] = Topic(
                     kind,
@@ -239,7 +233,7 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         for name, type_name in topics.GIVEN_POSES.items():
             # Frames of a rig have no prior.
             if not config.of_cameras or name != topics.PRIOR_ODOMETRY:
-                found[name] = Topic(message_class(type_name), self._take_pose)
+                found[name] = Topic(conversion.message_class(type_name), self._take_pose)
         return found
 
     def _take_frame(self, item: Input, message: Any) -> None:

@@ -60,26 +60,29 @@ def test_a_model_of_colmap(form, tmp_path):
     model = tmp_path / "a" / "b" / "sparse"
     shutil.copytree(COLMAP / form, model)
     assert read_map_file(model, "map").descriptors is None
-    assert read_map_file(model, "map", COLMAP / "database.db").equals(found)
+    shutil.copy(COLMAP / "database.db", model)
+    assert read_map_file(model, "map").equals(found)
 
 
-def database(path: Path, *changes: str) -> Path:
-    shutil.copy(COLMAP / "database.db", path / "database.db")
+def model_with(path: Path, *changes: str) -> Path:
+    """A model whose database has been changed."""
+    shutil.copytree(COLMAP / "binary", path, dirs_exist_ok=True)
+    shutil.copy(COLMAP / "database.db", path)
     with sqlite3.connect(path / "database.db") as tables:
         for change in changes:
             tables.execute(change)
     tables.close()
-    return path / "database.db"
+    return path
 
 
 def test_descriptors_of_other_extractors(tmp_path):
     # Binary ones that somebody imported: 32 of the 128 bytes.
     cut = "UPDATE descriptors SET cols = 32, data = CAST(zeroblob(rows * 32) AS BLOB)"
-    found = read_map_file(COLMAP / "binary", "map", database(tmp_path, cut))
+    found = read_map_file(model_with(tmp_path, cut), "map")
     assert (found.descriptors.dtype, found.descriptors.shape) == (np.uint8, (14, 32))
     # ALIKED and the like: bytes of floats.
     floats = "UPDATE descriptors SET type = 1, data = CAST(zeroblob(rows * 128) AS BLOB)"
-    found = read_map_file(COLMAP / "binary", "map", database(tmp_path, floats))
+    found = read_map_file(model_with(tmp_path, floats), "map")
     assert (found.descriptors.dtype, found.descriptors.shape) == (np.float32, (14, 32))
 
 
@@ -100,12 +103,13 @@ FIRST_FEATURE_OF_IMAGE_2 = (
     ],
 )
 def test_a_bad_database(tmp_path, change, text):
-    file = database(tmp_path, *change.split(";"))
+    model = model_with(tmp_path, *change.split(";"))
     with pytest.raises(MapError, match=text):
-        read_map_file(COLMAP / "binary", "map", file)
-    file.write_bytes(b"no database at all, but long enough to look like one" * 30)
+        read_map_file(model, "map")
+    text = "no database at all, but long enough to look like one" * 30
+    (model / "database.db").write_text(text)
     with pytest.raises(MapError, match="file is not a database"):
-        read_map_file(COLMAP / "binary", "map", file)
+        read_map_file(model, "map")
 
 
 def npy(shape: tuple[int, ...], kind: str, data: bytes = b"") -> bytes:

@@ -11,6 +11,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 
 from rs_localizer.config import DetectorConfig
+from rs_localizer.io.images import read_image
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.markers.maps import MarkerMap, wall
@@ -69,7 +70,7 @@ def test_images_become_correspondences(start_node, peer, tmp_path):
     answer = ask(image(5))
     detector = FrameDetector(DetectorConfig(marker_map=str(map_file)))
     assert answer.width == 8
-    assert answer == correspondences(detector.take(image(5)), make_message)
+    assert answer == correspondences(detector.detect(read_image(image(5))), make_message)
     assert answer.header.frame_id == "hall"
 
     # Whatever comes, the next good image is answered.
