@@ -77,7 +77,7 @@ def test_two_frames_that_another_matrix_explains_refuse_all_until_they_are_old()
         ("f of 0.6 times, facing board", 0, 50, "a focal length 1.6"),
         ("right: facing board", 110, 0, ""),
         ("f of 1.1 times, facing board", 110, 80, ""),
-        ("K of 640 x 640, board", 3, 2, "a principal point"),
+        ("K of 640 x 640, board", 15, 2, "a principal point"),
         ("K of 640 x 640, facing board", 110, 0, "a principal point"),
         ("squeezed by 2 %, corner", 110, 2, "fy over fx 0.98 times K's"),
         ("squeezed by 25 %, corner", 0, 6, "fy over fx 0.75"),
