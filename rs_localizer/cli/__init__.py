@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import shlex
 import shutil
@@ -74,21 +73,6 @@ def write_all(writers: Mapping[Path, Callable[[Path], object]]) -> None:
         print(f"written: {path}")
 
 
-def import_ros(name: str, what: str) -> Any:
-    """Import a module of ``rs_localizer.ros`` by name: all else works without ROS.
-
-    Raises:
-        ValueError: without ROS, which ``what`` needs.
-    """
-    try:
-        return importlib.import_module(f"rs_localizer.ros.{name}")
-    except ImportError as error:
-        raise ValueError(
-            f"{what} needs ROS 2 ({error}): source a ROS 2 workspace, or install rclpy with pip "
-            "(docs/install.md)"
-        ) from error
-
-
 def read_counts(text: str, option: str) -> tuple[int, int]:
     """Read columns and rows of ``6x4``; raise UsageError for anything else."""
     try:
@@ -107,25 +91,16 @@ def stage(name: str, total: int) -> Iterator[Callable[[int], object]]:
         yield bar.update
 
 
-def typed(executable: str, *words: str) -> str:
-    """Return the command line that runs an executable of this package here, to be pasted.
+def typed(*words: str) -> str:
+    """Return a command line of this program, to be pasted.
 
-    After ``make`` the executables are not in PATH.
+    After ``make`` it is not in PATH.
     """
-    return shlex.join([*_program(executable), *words])
-
-
-def _program(executable: str) -> list[str]:
-    in_path = shutil.which(executable)
-    # Look beside the running program, or, for ``python -m rs_localizer``, beside Python.
-    for program in (sys.argv[0], sys.executable):
-        beside = Path(os.path.abspath(program)).with_name(executable)
-        if not shutil.which(str(beside)):
-            continue
-        if in_path is not None and Path(in_path).samefile(beside):
-            return [executable]
-        here = Path.cwd()
-        return [str(beside.relative_to(here) if beside.is_relative_to(here) else beside)]
-    if in_path is not None or executable != "rs_localizer":
-        return [executable]
-    return [sys.executable, "-m", "rs_localizer"]
+    program, in_path = Path(sys.argv[0]), shutil.which("rs_localizer")
+    if program.name != "rs_localizer":
+        start = [sys.executable, "-m", "rs_localizer"]
+    elif in_path is not None and program.samefile(in_path):
+        start = ["rs_localizer"]
+    else:
+        start = [os.path.relpath(program)]
+    return shlex.join([*start, *words])

@@ -293,7 +293,7 @@ def _write(
         words += ["--map", str(shape), *(["--rate", str(args.rate)] if args.rate else [])]
         words += [word for text in args.remaps for word in ("-r", text)]
     words += ["--out", f"{out.with_suffix('')}_poses"]
-    print(f"next: {typed('rs_localizer', *words)}")
+    print(f"next: {typed(*words)}")
     return refused
 
 

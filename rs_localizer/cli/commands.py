@@ -227,7 +227,7 @@ def _report_error(name: str, error: Exception) -> int | None:
 @contextlib.contextmanager
 def _output(common: CommonOptions) -> Iterator[io.StringIO | None]:
     """Keep printed text from steering the terminal, within the context; yield hidden text."""
-    if common.json or common.quiet:
+    if common.json:
         # No bar either, which is for a person who waits.
         sys.stderr.isatty = lambda: False  # type: ignore[method-assign]
         with contextlib.redirect_stdout(io.StringIO()) as kept:

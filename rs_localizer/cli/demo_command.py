@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import tempfile
 import time
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, detect_command, import_ros, simulate_command, stage, typed
+from rs_localizer.cli import WORKING, detect_command, simulate_command, stage, typed
 from rs_localizer.cli.options import option
 from rs_localizer.config import NodeConfig
 
@@ -74,7 +75,7 @@ def run(options: Options) -> None:
         _localized("Walls of markers", *_simulated(most, images=True))
         _live(flight, answers[_METHODS[0]], readout_time)
     print(f"{picture}\ndone in {time.monotonic() - started:.0f} s")
-    print(f"next: {typed('rs_localizer', 'markers', 'make', 'board', '--help')}")
+    print(f"next: {typed('markers', 'make', 'board', '--help')}")
 
 
 def _recorded(path: Path, place: Path, most: int | None) -> tuple[list[Frame], float]:
@@ -140,7 +141,8 @@ def _settings(solver: str, readout_time: float) -> dict[str, Any]:
 
 def _live(frames: Sequence[Frame], answers: Mapping[int, Localized], readout_time: float) -> None:
     """Localize the flight once more with a live node, and compare."""
-    live, late, same = import_ros("live", "a live node"), list[float](), 0
+    live = importlib.import_module("rs_localizer.ros.live")  # ROS is what nothing else needs
+    late, same = list[float](), 0
     settings = _settings(_METHODS[0], readout_time)
     with (
         live.LiveNode(settings, round(0.5e9 * readout_time)) as node,

@@ -72,7 +72,7 @@ def run(args: Options) -> Figures:
     parameters = args.out / PARAMETERS
     params = ["--params", str(parameters)] if parameters.exists() else []
     words = ["replay", str(args.out), *params, "--out", f"{args.out}_poses"]
-    print(f"next: {typed('rs_localizer', *words)}{' --map MAP' if args.features else ''}")
+    print(f"next: {typed(*words)}{' --map MAP' if args.features else ''}")
     return figures
 
 

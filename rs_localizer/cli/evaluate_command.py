@@ -4,15 +4,12 @@
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
 from rs_localizer.cli import WORKING, write_all
 from rs_localizer.cli.options import argument, option
 from rs_localizer.cli.recording_input import remapped
-from rs_localizer.io.bags import BagError, open_bag
-from rs_localizer.io.recording import CORRESPONDENCES_TOPIC, IMAGE_TOPIC, RAW_IMAGE_TOPIC
 
 if WORKING:
     import numpy as np
@@ -54,7 +51,7 @@ def run(options: Options) -> Figures:
             f"{options.truth}: {_span(estimate.poses)} against {_span(truth.poses)}"
         )
     print(f"{len(rows)} of {len(estimate.poses)} poses compared")
-    print(_coverage(options.truth, len(rows), len(np.unique(true_rows)), len(truth.poses)))
+    print(f"{len(np.unique(true_rows))} of {len(truth.poses)} true poses have an estimate")
     found, figures = errors.errors_of(estimate, truth), Figures(poses=len(rows))
     print(f"\n{'error':26}{'count':>6}{'median':>11}{'mean':>11}{'95 %':>11}{'largest':>11}")
     for kind, (_, values) in found.items():
@@ -72,16 +69,6 @@ def run(options: Options) -> Figures:
     if options.plot is not None:
         write_all({options.plot: lambda part: errors.draw({"estimate": found}, part)})
     return figures
-
-
-def _coverage(path: Path, posed: int, met: int, true: int) -> str:
-    """Return the share of the truth that has been localized, as a sentence."""
-    # Of a recording, not of text; the truth may stand there for several instants of each frame.
-    with contextlib.suppress(BagError), open_bag(path) as bag:
-        topics = (CORRESPONDENCES_TOPIC, IMAGE_TOPIC, RAW_IMAGE_TOPIC)
-        if of_frames := next((topic for topic in topics if topic in bag.topics), None):
-            return f"{posed} of {bag.count({of_frames})} frames have a pose"
-    return f"{met} of {true} true poses have an estimate"
 
 
 def _span(poses: Trajectory) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from rs_localizer.cli import WORKING, read_counts, refuse_existing
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.markers.families import FAMILIES, family
-from rs_localizer.tools.printing import PAGES, largest_side, page_files, plan, write_pages
+from rs_localizer.tools.printing import PAGES, largest_side, plan, write_pages
 
 if WORKING:
     from rs_localizer.io.atomic_files import atomic_files
@@ -32,7 +32,7 @@ _STANDING = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 @dataclass(frozen=True, kw_only=True)
 class Options(ResultOptions):
-    out: Path = argument("OUT.pdf or OUT.png to print, and beside it the map OUT.yaml", "OUT")
+    out: Path = argument("OUT.pdf to print, and beside it the map OUT.yaml", "OUT")
     grid: str | None = option(
         f"markers, columns x rows (default: {_GRID}); where they do not fit on a page together, "
         "each has its own and is mounted as in the map", "2x3",
@@ -58,21 +58,19 @@ def run(options: Options) -> dict[str, object]:
         marker_map = _map(options)
     except ValueError as error:  # the options are all that can be wrong with it
         raise UsageError(str(error)) from error
-    prints = options.out if options.out.suffix in (".pdf", ".png") else Path(f"{options.out}.pdf")
     pages = plan(marker_map, options.page)
-    written = (*page_files(prints, len(pages)), prints.with_suffix(".yaml"))
+    prints = options.out if options.out.suffix == ".pdf" else Path(f"{options.out}.pdf")
+    written = prints, map_file = prints, prints.with_suffix(".yaml")
     refuse_existing(options, *written)
-    with atomic_files(*written) as (*_, map_part):
-        write_pages(pages, map_part.with_name(prints.name))
+    with atomic_files(*written) as (part, map_part):
+        write_pages(pages, part)
         write_marker_map(map_part, marker_map)
-    *files, map_file = written
-    shown = str(files[0]) if len(files) == 1 else f"{files[0]} ... {files[-1].name}"
     count = f"{len(pages)} page{'s' if len(pages) > 1 else ''} of {options.page}"
-    print(f"{shown}: {count}; print at 100 % and measure the bar")
+    print(f"{prints}: {count}; print at 100 % and measure the bar")
     print(f"{map_file}: {len(marker_map.points)} corners in {marker_map.map_frame}")
     if len(pages) > 1:
         print("the markers do not fit on a page together: mount each where the map has it")
-    return {"pages": files, "map": map_file, "corners": len(marker_map.points)}
+    return {"pages": prints, "map": map_file, "corners": len(marker_map.points)}
 
 
 def _map(options: Options) -> MarkerMap:

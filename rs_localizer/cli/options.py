@@ -24,7 +24,6 @@ from rs_localizer.config import meant
 T = TypeVar("T")
 MORE = " (--help says more)"
 """Behind faults of the command line."""
-_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 
 
 class UsageError(ValueError):
@@ -58,7 +57,7 @@ def option(
 
     Args:
         help: description; a default that is not None, False or an empty list is added.
-        metavar: of its value; of a list whose values stand behind one flag, ``ID ...``.
+        metavar: of its value.
         default: ``list`` for one that may be repeated; of a switch, False.
         flag: another name, such as ``-p``, or several.
         choices: of a text.
@@ -107,25 +106,10 @@ class ResultOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FleetOptions:
-    """many recordings."""
-
-    workers: int | None = option(
-        "recordings at a time, each in a process of its own (pip install 'rs_localizer[fleet]')",
-        "N", least=1,
-    )  # fmt: skip
-    scheduler: str | None = option(
-        "instead: the workers of a Dask scheduler, such as tcp://host:8786, which see these files "
-        "(pip install 'rs_localizer[fleet]')", "ADDRESS",
-    )  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
 class CommonOptions:
     """of all commands."""
 
     json: bool = option("print the result as JSON", default=False)
-    quiet: bool = option("print nothing but faults", default=False, flag="-q --quiet")
     verbose: bool = option("print the traceback of a fault", default=False, flag="-v --verbose")
 
 
@@ -162,7 +146,7 @@ def add_options(parser: argparse.ArgumentParser, kind: type[Any], *more: type[An
 def _add(group: argparse._ActionsContainer, kind: type[Any], item: Any) -> None:
     about, name = item.metadata, item.name
     one, many = _element(typing.get_type_hints(kind)[name])
-    repeated = many is list and not about["metavar"].endswith("...")
+    repeated = many is list
     if typing.get_origin(one) is tuple:  # each time this many
         one, many = _element(one)
     words: dict[str, Any] = {"help": about["help"].replace("%", "%%")}
@@ -170,14 +154,12 @@ def _add(group: argparse._ActionsContainer, kind: type[Any], item: Any) -> None:
         words["action"] = "store_true"
     else:
         limits, words["metavar"] = about.get("limits", ()), about["metavar"] or None
-        types = {float: number(*limits), int: integer(*limits), Path: path}
+        types = {float: number(*limits), int: integer(*limits)}
         words["type"] = types.get(one, one)
         if about.get("choices"):
             words["choices"] = about["choices"]
         if isinstance(many, int):
             words |= {"nargs": many, "metavar": tuple(about["metavar"].split())}
-        elif many is list and about["metavar"].endswith("..."):
-            words |= {"nargs": "+", "metavar": about["metavar"].removesuffix(" ...")}
     if about["positional"]:
         if many is list:
             words["nargs"] = "+" if item.default_factory is MISSING else "*"
@@ -185,8 +167,8 @@ def _add(group: argparse._ActionsContainer, kind: type[Any], item: Any) -> None:
             words |= {"nargs": "?", "default": item.default}
         group.add_argument(name, **words)
         return
-    if many is list or repeated:
-        words |= {"default": []} | ({"action": "append"} if repeated else {})
+    if repeated:
+        words |= {"default": [], "action": "append", "required": about["required"]}
     elif one is not bool:
         words |= {"default": item.default, "required": about["required"]}
         if item.default is not None:
@@ -218,15 +200,6 @@ def read(kind: type[T], namespace: argparse.Namespace) -> T:
         several = isinstance(value, list) and isinstance(_element(hints[item.name])[1], int)
         given[item.name] = tuple(value) if several else value
     return kind(**given)
-
-
-def path(text: str) -> Path:
-    """Return a path on this machine; refuse a URL."""
-    if _URL.match(text):
-        raise argparse.ArgumentTypeError(
-            f"must be a path of this machine, got {text}: mount it, or copy it here"
-        )
-    return Path(text)
 
 
 def number(

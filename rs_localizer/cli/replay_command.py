@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from rs_localizer.cli import WORKING, earlier_result, refuse_existing
-from rs_localizer.cli.options import FleetOptions, ResultOptions, UsageError, argument, option
+from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.cli.recording_input import ImageOptions, given_topics, given_values
 from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import is_bag, open_bag
@@ -45,7 +45,7 @@ TABLE = "frames.parquet"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(ImageOptions, FleetOptions, ResultOptions):
+class Options(ImageOptions, ResultOptions):
     recordings: list[Path] = argument(
         "rosbag2 (MCAP, sqlite3) or ROS 1 bag; with --map, a video, a folder or a bag of images",
         "RECORDING",
@@ -71,6 +71,14 @@ class Options(ImageOptions, FleetOptions, ResultOptions):
         "also write one table of all recordings, a row a frame: poses, twists, covariances, why "
         "frames were refused (pip install 'rs_localizer[table]')", "FILE",
     )  # fmt: skip
+    workers: int | None = option(
+        "recordings at a time, each in a process of its own (pip install 'rs_localizer[fleet]')",
+        "N", least=1,
+    )  # fmt: skip
+    scheduler: str | None = option(
+        "instead: the workers of a Dask scheduler, such as tcp://host:8786, which see these files",
+        "ADDRESS",
+    )
 
 
 def run(options: Options) -> Figures | None:

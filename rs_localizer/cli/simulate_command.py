@@ -146,7 +146,7 @@ class Options(MotionOptions, CameraOptions, ResultOptions):
     images: bool = option("render camera images, instead of points", default=False)
     walls: str = option(
         "of images; three: walls of markers at right angles, with their map; room: generated "
-        "pictures; marked_room: with a few markers on its walls",
+        "pictures",
         default=next(iter(SCENES)), choices=list(SCENES),
     )  # fmt: skip
     exposure: float = option("of a row: motion blur of images", "S", _PICTURES.exposure, least=0.0)
@@ -320,5 +320,5 @@ class _Recorder:
             following = ["detect", out, "--map", f"{out}/{MARKER_MAP}", "--out", f"{out}_markers"]
         print(said)
         if following:
-            print(f"next: {typed('rs_localizer', *following)}")
+            print(f"next: {typed(*following)}")
         return figures

@@ -241,13 +241,6 @@ class CameraCalibration:
         return f"not observable: {value:.1f} +- {1e3 * self.deviation:.1f} ms{why}"
 
     @property
-    def held(self) -> int:
-        """Landmarks that are seen often enough to have a shape estimated, but are too many."""
-        observations = self.posed.observations
-        often = len(observations.points) >= _LEAST_SIGHTS * len(observations.landmarks)
-        return len(observations.landmarks) if often and self.fit.freedom.landmarks == 0.0 else 0
-
-    @property
     def shape_deviation(self) -> float:
         """Deviation of landmarks (m, rms), by noise and half of what halves differ by."""
         count = 3 * len(np.unique(self.posed.observations.points))

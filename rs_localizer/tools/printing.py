@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A board or a wall of markers as PDF or PNG, true to scale."""
+"""A board or a wall of markers as PDF, true to scale."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ from rs_localizer.markers.prints import Board, Chessboard, Pose
 PAGES = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
 # mm: printers leave about 5 white; the foot holds a bar to measure and what is said.
 _MARGIN, _FOOT, _BAR = 10.0, 16.0, 100.0
-_MM, _INCH, _PNG_DPI = 1000.0, 25.4, 300
+_MM, _INCH = 1000.0, 25.4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,36 +139,17 @@ def _rectangles(white: NDArray[np.bool_], cell: float) -> Array:
     return np.array(rectangles, np.float64).reshape(-1, 4)
 
 
-def page_files(path: Path, count: int) -> list[Path]:
-    """Return the files of this many pages: one PDF, or a PNG for each.
-
-    Raises:
-        ValueError: for another ending.
-    """
-    if path.suffix not in (".pdf", ".png"):
-        raise ValueError(f"{path} must end in .pdf or .png")
-    if count == 1 or path.suffix == ".pdf":
-        return [path]
-    return [path.with_stem(f"{path.stem}_{k + 1}") for k in range(count)]
-
-
-def write_pages(pages: list[Page], path: Path) -> list[Path]:
-    """Write a PDF, or a PNG for each page (by the path's ending); the files."""
+def write_pages(pages: list[Page], path: Path) -> None:
+    """Write a PDF."""
     from matplotlib.backends.backend_pdf import PdfPages
 
-    files = page_files(path, len(pages))
-    figures = [_draw(page, f"page {k + 1} of {len(pages)}") for k, page in enumerate(pages)]
-    if path.suffix == ".pdf":
-        with PdfPages(path) as document:
-            for figure in figures:
-                document.savefig(figure)
-    else:
-        for figure, file in zip(figures, files, strict=True):
-            figure.savefig(file, dpi=_PNG_DPI)
-    return files
+    with PdfPages(path) as document:
+        for k, page in enumerate(pages):
+            document.savefig(draw(page, f"page {k + 1} of {len(pages)}"))
 
 
-def _draw(page: Page, number: str) -> Any:
+def draw(page: Page, number: str) -> Any:
+    """Return the figure of a page, true to scale, with its number at the foot."""
     from matplotlib.figure import Figure
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path as Outline

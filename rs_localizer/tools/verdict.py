@@ -82,11 +82,6 @@ def remarks(result: CameraCalibration) -> Iterator[str]:
             f"parts of the recording differ by more than their noise: the deviation is "
             f"{result.inflation:.1f} times that of the noise alone"
         )
-    if result.held:
-        yield (
-            f"the map's {result.held} points are taken as they are given: more than are estimated "
-            "along; where they may be off by a thousandth of its size, show a smaller board"
-        )
     observations = result.posed.observations
     pixels = observations.pixels[observations.trusted]
     cells = (3.0 * pixels / result.fit.camera.size).astype(int).clip(0, 2)

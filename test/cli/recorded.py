@@ -37,7 +37,7 @@ def flight(points: Any, count: int, settings: FrameSettings, start_ns: int) -> l
 
 def record(*words: object) -> None:
     """Write the recording that a command line of ``simulate`` orders."""
-    assert main(["--quiet", "simulate", *map(str, words)]) == 0
+    assert main(["--json", "simulate", *map(str, words)]) == 0
 
 
 def tf(parent: str, child: str, position: Any, turn: Rotation, stamp_ns: int = 0) -> Any:

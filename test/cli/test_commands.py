@@ -87,7 +87,6 @@ for words in {[name.split() for name in COMMANDS]}:
         (["map", "bild"], "there is no command 'map bild'; did you mean map build?"),
         (["repaly"], "there is no command 'repaly'; did you mean replay?"),
         (["replay", "bag", "--smoth"], "unrecognized arguments: --smoth; did you mean --smooth?"),
-        (["replay", "bag", "--out=s3://b/c"], "must be a path of this machine, got s3://b/c"),
         (["replay"], "the following arguments are required: RECORDING"),
         (["replay", "bag", "-p", "sead:=1"], "'sead' is not a setting"),
         (["replay", "a", "b"], "many recordings need --out DIR"),
@@ -136,7 +135,6 @@ def test_faults_are_one_line_and_an_exit_code(error, code, text, command, ran):
     said = ran("replay", code=code)
     assert said.out == "frame \\x1b]0;title\\x07 \\x9b2J\n\tä\n"
     assert said.err.endswith(text)
-    assert ran("replay", "-q", code=code) == ("", said.err)
 
 
 def test_tracebacks_are_those_of_faults_in_the_program_and_of_verbose(command, ran):

@@ -3,6 +3,7 @@
 """A hand-held gripper with a camera: videos of a room and of demonstrations -> trajectories."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,13 +17,17 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.recording import MAP, MAP_FRAME
 from rs_localizer.io.trajectories import read_tum
+from rs_localizer.markers.dictionaries import pattern
+from rs_localizer.markers.families import family
 from rs_localizer.markers.map_files import write_marker_map
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.markers.prints import Marker, Pose
 from rs_localizer.tools.mapping.gauge import through
 from rs_localizer.tools.simulation.renderer import Renderer
 from rs_localizer.tools.simulation.simulated_frames import frame_stamps
 from rs_localizer.tools.simulation.simulated_settings import ImageSettings
 from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
-from rs_localizer.tools.simulation.walls import marked_room
+from rs_localizer.tools.simulation.walls import Scene, printed, room
 
 pytest.importorskip("pycolmap")
 pytest.importorskip("pyarrow", reason="needs pyarrow", exc_type=ImportError)
@@ -35,11 +40,34 @@ WALK, DEMOS = (37.4, 2.2), ((37.56, 0.5), (38.3, 0.5))  # start and duration, s
 MOTION = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
 
 
+def marked_room() -> Scene:
+    """A room with two markers on each wall, whose pictures those who stand inside may read."""
+    path = sampled_states(MOTION)
+    drawn, middle, scene, markers = family("4x4_250"), path.positions.mean(axis=0), room(path), []
+    for plane in scene.planes:
+        sheet = 14 * (drawn.cells + 2)
+        mirrored = (middle - plane.corner) @ plane.normal > 0.0
+        upright = abs(plane.down[2]) > 0.5
+        for share in (0.3, 0.7) if abs(plane.normal[2]) < 0.5 else ():
+            white = np.pad(pattern(drawn, len(markers)), 1, constant_values=True)
+            sides = np.array(plane.texture.shape[::-1])
+            left, top = np.rint(sides * ((share, 0.5) if upright else (0.5, share)) - 0.5 * sheet)
+            left, top = int(left), int(top)
+            paper = printed(white, (235, 26), 14)[:, :: -1 if mirrored else 1]
+            plane.texture[top : top + sheet, left : left + sheet] = paper
+            centre = plane.points(np.array([[left + 0.5 * sheet, top + 0.5 * sheet]]))[0]
+            right, up = (-plane.right if mirrored else plane.right), -plane.down
+            pose = Pose(centre, np.column_stack([right, up, np.cross(right, up)]))
+            side = 14 * drawn.cells * plane.texel
+            markers.append(Marker.at("4x4_250", len(markers), side, pose))
+    return replace(scene, marker_map=MarkerMap(tuple(markers)))
+
+
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory) -> SimpleNamespace:
     """Videos along a recorded motion in a rendered room with markers; a map of the first one."""
     folder = tmp_path_factory.mktemp("gripper")
-    scene = marked_room(sampled_states(MOTION))
+    scene = marked_room()
     renderer = Renderer(CAMERA, scene.planes, ImageSettings(noise=1.0))
 
     def film(start: float, duration: float, path: Path) -> np.ndarray:

@@ -7,14 +7,22 @@ import re
 import cv2
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.markers.prints import Charuco, Chessboard
-from rs_localizer.tools.printing import PAGES, largest_side, plan, write_pages
+from rs_localizer.tools.printing import PAGES, Page, draw, largest_side, plan, write_pages
 
-PIXEL = 0.0254 / 300  # m, of the PNG files
+PIXEL = 0.0254 / 300  # m, of the pictures
+
+
+def picture(page: Page) -> np.ndarray:
+    canvas = FigureCanvasAgg(draw(page, "page 1 of 1"))
+    canvas.figure.set_dpi(300)
+    canvas.draw()
+    return cv2.cvtColor(np.asarray(canvas.buffer_rgba()), cv2.COLOR_RGBA2GRAY)
 
 
 @pytest.mark.parametrize(
@@ -25,10 +33,9 @@ PIXEL = 0.0254 / 300  # m, of the PNG files
         MarkerMap(boards=(Charuco(5, 6, 0.035, 0.025, family("5x5_100"), 7, True),)),
     ],
 )
-def test_a_page_is_as_its_map(marker_map, tmp_path):
+def test_a_page_is_as_its_map(marker_map):
     (page,) = plan(marker_map)
-    (file,) = write_pages([page], tmp_path / "page.png")
-    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    image = picture(page)
     np.testing.assert_allclose(sorted(image.shape), np.array(PAGES["a4"]) / 25.4 * 300, atol=1)
     found = MarkerDetector(marker_map).detect(image)
     assert len(found.ids) == len(marker_map.points)
@@ -40,13 +47,11 @@ def test_a_page_is_as_its_map(marker_map, tmp_path):
     assert (image.shape[0] > image.shape[1]) == (page.height > page.width)
 
 
-def test_markers_that_do_not_fit_together_get_pages_of_their_own(tmp_path):
+def test_markers_that_do_not_fit_together_get_pages_of_their_own():
     marker_map = MarkerMap(wall("4x4_50", (3, 1), 0.12, 0.1))
     pages = plan(marker_map)
     assert len(pages) == 3
-    files = write_pages(pages, tmp_path / "wall.png")
-    assert [file.name for file in files] == ["wall_1.png", "wall_2.png", "wall_3.png"]
-    found = MarkerDetector(marker_map).detect(cv2.imread(str(files[1]), cv2.IMREAD_GRAYSCALE))
+    found = MarkerDetector(marker_map).detect(picture(pages[1]))
     assert found.ids.tolist() == [4, 5, 6, 7]
     side = np.linalg.norm(found.pixels[0] - found.pixels[1]) * PIXEL
     assert side == pytest.approx(0.12, abs=3e-5)
@@ -65,7 +70,8 @@ def test_the_largest_markers_fill_the_page(page, side):
 
 def test_pdf_has_the_size_of_the_paper(tmp_path):
     pages = plan(MarkerMap(wall("4x4_50", (3, 1), 0.12, 0.1)), "letter")
-    (file,) = write_pages(pages, tmp_path / "wall.pdf")
+    file = tmp_path / "wall.pdf"
+    write_pages(pages, file)
     boxes = re.findall(rb"/MediaBox \[ ?0 0 ([\d.]+) ([\d.]+) ?\]", file.read_bytes())
     assert len(boxes) == 3
     for width, height in boxes:

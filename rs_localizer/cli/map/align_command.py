@@ -32,9 +32,6 @@ class Options(info_command.Options, ResultOptions):
         "they are", "ID ID M",
     )  # fmt: skip
     up: tuple[float, float, float] | None = option("z of the new map, in the map as it is", "X Y Z")
-    floor: list[int] = option(
-        "instead: three ids or more in a level plane at the bottom of the map", "ID ...", list
-    )
     origin: int | None = option("id at the origin", "ID")
 
 
@@ -42,15 +39,14 @@ def run(options: Options) -> info_command.Figures:
     suffix = options.out.suffix
     if suffix not in _OUTPUTS:
         raise UsageError(f"OUT must end in {' or '.join(_OUTPUTS)}, got {options.out}")
-    for one, other in (("scale", "distance"), ("up", "floor")):
-        if getattr(options, one) and getattr(options, other):
-            raise UsageError(f"give one of --{one}, --{other}")
+    if options.scale and options.distance:
+        raise UsageError("give one of --scale, --distance")
     refuse_existing(options)
     any_map, kind = info_command.read(options)
     if isinstance(any_map, Map) and suffix != SUFFIX:
         raise UsageError(f"{options.file} holds landmarks, which go to {SUFFIX}")
-    wishes = (options.scale, options.distance, options.up, options.floor, options.origin)
-    if any(wish not in (None, []) for wish in wishes):
+    wishes = (options.scale, options.distance, options.up, options.origin)
+    if wishes != (None,) * 4:
         by = alignment(any_map, *wishes)
         turn = np.degrees(Rotation.from_matrix(by.rotation).magnitude())
         shift = ", ".join(f"{value:.4f}" for value in by.translation)

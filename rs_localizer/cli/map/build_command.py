@@ -33,13 +33,7 @@ if WORKING:
     from rs_localizer.markers.map_files import read_marker_map
     from rs_localizer.settings import build, write_parameters
     from rs_localizer.tools.mapping.anchors import Anchors, Distance, PointSight
-    from rs_localizer.tools.mapping.build import (
-        Built,
-        Given,
-        build_map,
-        filming_advice,
-        result_rows,
-    )
+    from rs_localizer.tools.mapping.build import Built, Given, build_map, result_rows
     from rs_localizer.tools.mapping.structure import Looked, Looker, look_through, require
 
 
@@ -171,7 +165,5 @@ def _print_result(args: Options, built: Built, looked: Looked) -> None:
         print(f"warning: {built.readout_check.message}; the map has what was estimated")
     if built.placement.doubt:
         print(f"warning: {built.placement.doubt}")
-    for text in filming_advice(built, looked.views):
-        print(f"to film otherwise: {text}")
-    following = typed("rs_localizer", "replay", "IMAGES", "--map", str(args.out), "--out", "poses")
+    following = typed("replay", "IMAGES", "--map", str(args.out), "--out", "poses")
     print(f"next, for images of another walk: {following}")

@@ -25,7 +25,6 @@ if WORKING:
     import numpy as np
     from tqdm import tqdm
 
-    from rs_localizer.core.arrays import Array
     from rs_localizer.io.atomic_files import atomic_directory
     from rs_localizer.io.bags import open_bag
     from rs_localizer.io.camera_files import write_calibration
@@ -37,7 +36,6 @@ if WORKING:
     from rs_localizer.tools.mapping.map_keypoints import MapFreedom, RecordedMap, from_recording
     from rs_localizer.tools.mapping.refinement import RefinedMap, refine
 
-_HOLD = 0.001  # m, of landmarks of known place: as a tape or a total station measures them
 _step = partial(print, "adjusted:", flush=True)
 
 
@@ -47,10 +45,6 @@ class Options(LensOptions, ResultOptions):
     map: Path | None = option("the map (default: the points of the recording)", "MAP")
     out: Path | None = option(f"ends in {SUFFIX}", "OUT")
     intrinsics: bool = option("adjust the lens as well", default=False)
-    hold: list[int] = option(
-        "landmarks of known place, three or more: they hold frame and size of the map (default: "
-        "the map as a whole stays where it is, with the size that it has)", "ID ...", list,
-    )  # fmt: skip
     colmap: tuple[Path, Path] | None = option(
         "instead of RECORDING: folder of a sparse model of COLMAP, text or binary, of one camera, "
         "and one to create, for programs that know a global shutter only", "IN OUT",
@@ -77,7 +71,8 @@ def run(args: Options) -> None:
     camera = replace(lens, readout_time=config.readout_time, scan_direction=config.scan_direction)
     with tqdm(total=len(clouds), unit="image", desc="localize", disable=None) as bar:
         localized = from_recording(camera, clouds, landmarks, bar.update)
-    deviations = _deviations(args, localized.landmarks, config.map_deviation)
+    spread = config.map_deviation
+    deviations = np.full(len(localized.landmarks), spread) if spread > 0.0 else None
     freedom = MapFreedom(
         readout_time=not config.readout_time > 0.0, lens=args.intrinsics, deviations=deviations
     )
@@ -89,18 +84,6 @@ def run(args: Options) -> None:
     if refined.readout_check is not None:
         refined.readout_check.refuse()
     _write(args, args.out, localized.landmarks, refined)
-
-
-def _deviations(args: Options, landmarks: Map, map_deviation: float) -> Array | None:
-    """Return the known standard deviation (m) of each landmark; None if none is known."""
-    every = map_deviation if map_deviation > 0.0 else np.inf
-    if not args.hold:
-        return np.full(len(landmarks), every) if map_deviation > 0.0 else None
-    if landmarks.ids is None:
-        raise UsageError("--hold needs a map with ids")
-    if unknown := sorted(set(args.hold) - set(landmarks.ids.tolist())):
-        raise UsageError(f"--hold: the map has no landmark {unknown[0]}")
-    return np.where(np.isin(landmarks.ids, args.hold), _HOLD, every)
 
 
 def _print_result(localized: RecordedMap, refined: RefinedMap) -> None:
@@ -150,8 +133,8 @@ def _write(args: Options, out: Path, landmarks: Map, result: RefinedMap) -> None
 
 
 def _undo_shutter(args: Options, folder: Path, out: Path) -> None:
-    for name in ("recording", "out", "map", "hold"):
-        if getattr(args, name) not in (None, [], Path()):
+    for name in ("recording", "out", "map"):
+        if getattr(args, name) not in (None, Path()):
             raise UsageError(f"--colmap goes without {'--' * (name != 'recording')}{name}")
     try:
         model = read_model(folder)

@@ -123,15 +123,6 @@ def _print_result(found: Survey, images: int) -> None:
         place, turn = np.linalg.norm(deviations.reshape(2, 3), axis=1) * [1e3, np.degrees(1.0)]
         name, mark = marker.name.removeprefix("marker "), " poor" if poor else ""
         print(f"{name:26} {sights:6} {x:9.4f} {y:9.4f} {z:9.4f} {place:8.2f} {turn:8.3f}{mark}")
-    # In the frame of the origin, its own errors are in all other poses.
-    origin = found.markers[0]
-    turn = np.degrees(np.linalg.norm(found.deviations_of_shape[0, 3:]))
-    far = int(np.argmax([np.linalg.norm(marker.pose.position) for marker in found.markers]))
-    there = 1e3 * np.linalg.norm(found.deviations[far, :3])
-    print(
-        f"frame: that of {origin.name}, whose own orientation is known to {turn:.3f} deg: in it, "
-        f"{found.markers[far].name} is known to {there:.1f} mm"
-    )
     if found.poor.any():
         poor = tuple(found.markers[k] for k in np.flatnonzero(found.poor))
         print(f"warning: known to worse than a tenth of their size: {_listed(poor)}")

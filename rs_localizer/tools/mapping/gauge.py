@@ -11,7 +11,6 @@ errors of its own orientation grow with the distance from it; held by all corner
 left is the error of the shape alone.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -170,16 +169,10 @@ def of_the_shape(covariance: Array, corners: Array) -> Array:
     return np.asarray(free @ covariance @ free.T)
 
 
-_LEAST_FLOOR = 3  # points make a plane
-# A floor whose points lie within this part of their extent of a line has no direction.
-_LINE = 1e-3
-
-
 def alignment(
     any_map: Map | MarkerMap, scale: float | None = None,
     distance: tuple[float, float, float] | None = None,
-    up: tuple[float, float, float] | None = None, floor: Sequence[int] = (),
-    origin: int | None = None,
+    up: tuple[float, float, float] | None = None, origin: int | None = None,
 ) -> Similarity:  # fmt: skip
     """Return the similarity that brings a map to where it is wanted.
 
@@ -187,11 +180,10 @@ def alignment(
         scale: factor.
         distance: instead, between two ids, m.
         up: along the map's axes as they are.
-        floor: instead, ids in a level plane, below the rest.
         origin: id.
 
     Raises:
-        ValueError: for ids that the map does not have, or points that tell no direction or size.
+        ValueError: for ids that the map does not have, or points that tell no size.
     """
     if isinstance(any_map, MarkerMap):
         what, places = "marker", {one.id: one.pose.position for one in any_map.markers}
@@ -207,8 +199,6 @@ def alignment(
     upward = np.array(up or (0.0, 0.0, 1.0))
     if not np.linalg.norm(upward) > 0.0:
         raise ValueError("the direction of up must not be 0 0 0")
-    if floor:
-        upward = _normal(np.array([place(number) for number in floor]), any_map.points)
     turn, scale = upright(-upward), scale or 1.0
     if distance is not None:
         one, other, wanted = distance
@@ -219,18 +209,6 @@ def alignment(
         scale = wanted / apart
     zero = np.zeros(3) if origin is None else place(origin)
     return Similarity(scale, turn, -scale * turn @ zero)
-
-
-def _normal(floor: Array, points: Array) -> Array:
-    """Return the normal of a floor (n,3), towards the side of all other points (p,3)."""
-    if len(floor) < _LEAST_FLOOR:
-        raise ValueError(f"a floor needs at least {_LEAST_FLOOR} ids, got {len(floor)}")
-    middle = floor.mean(axis=0)
-    _, extents, axes = np.linalg.svd(floor - middle)
-    if not extents[1] > _LINE * extents[0]:
-        raise ValueError("the ids of the floor lie on a line, which determines no level")
-    normal = axes[2]
-    return np.asarray(normal if (points.mean(axis=0) - middle) @ normal >= 0.0 else -normal)
 
 
 def moved_map(any_map: Map | MarkerMap, by: Similarity) -> Map | MarkerMap:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import cv2
@@ -256,51 +256,5 @@ def _picture(
     )
 
 
-# Texels along a cell of a marker: corners lie between texels, so that nothing is rounded.
-_POSTER_TEXELS = 14
-# Places of the markers along a wall, in shares of its width.
-_PLACES = (0.3, 0.7)
-PAPER_AND_INK = (235, 26)
-
-
-def marked_room(path: TrueState) -> Scene:
-    """Return :func:`rs_localizer.tools.simulation.walls.room` with two markers on each wall.
-
-    Floor and ceiling have none.
-    """
-    bare = room(path)
-    middle = path.positions.mean(axis=0)
-    planes, markers = list[TexturedPlane](), list[Marker]()
-    for plane in bare.planes:
-        if abs(plane.normal[2]) > 0.5:
-            planes.append(plane)
-            continue
-        texture = plane.texture.copy()
-        for share in _PLACES:
-            markers.append(_hang(texture, plane, share, len(markers), middle))
-        planes.append(replace(plane, texture=texture))
-    return Scene(tuple(planes), MarkerMap(tuple(markers)))
-
-
-SCENES = {"three": three_walls, "room": room, "marked_room": marked_room}
+SCENES = {"three": three_walls, "room": room}
 """All scenes by name, the first one unless another is wanted."""
-
-
-def _hang(texture: Image, plane: TexturedPlane, share: float, number: int, viewer: Array) -> Marker:
-    """Draw a marker into the picture of a plane; the marker."""
-    drawn = family(_FAMILY)
-    side = drawn.cells * _POSTER_TEXELS
-    sheet = side + 2 * _POSTER_TEXELS
-    white = np.pad(pattern(drawn, number), 1, constant_values=True)
-    paper = printed(white, PAPER_AND_INK, _POSTER_TEXELS)
-    # Seen from inside the room, half of the walls are mirrored.
-    mirrored = float(plane.normal @ (viewer - plane.corner)) > 0.0
-    height, width = texture.shape
-    upright = abs(plane.down[2]) > 0.5
-    along, across = (share * width, 0.5 * height) if upright else (0.5 * width, share * height)
-    left, top = round(along - 0.5 * sheet), round(across - 0.5 * sheet)
-    texture[top : top + sheet, left : left + sheet] = paper[:, ::-1] if mirrored else paper
-    centre = plane.points(np.array([[left + 0.5 * sheet, top + 0.5 * sheet]]))[0]
-    right, up = (-plane.right if mirrored else plane.right), -plane.down
-    pose = Pose(centre, np.column_stack([right, up, np.cross(right, up)]))
-    return Marker.at(_FAMILY, number, side * plane.texel, pose)

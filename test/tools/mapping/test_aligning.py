@@ -28,8 +28,8 @@ def room() -> Map:
     return Map(points, np.arange(20), None, "map", covariances=covariances, error_modes=modes)
 
 
-def test_floor_size_and_origin():
-    by = alignment(room(), distance=(4, 9, 1.5), floor=[0, 1, 2, 3], origin=2)
+def test_up_size_and_origin():
+    by = alignment(room(), distance=(4, 9, 1.5), up=tuple(TURN[:, 2]), origin=2)
     found = moved_map(room(), by)
     np.testing.assert_allclose(found.points[:4, 2], 0.0, atol=1e-12)
     assert np.all(found.points[4:, 2] > 0.0)
