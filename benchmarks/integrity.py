@@ -36,8 +36,11 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.integrity import INNOVATION, Integrity
 from rs_localizer.localizer import Localizer
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, simulate_frames
-from rs_localizer.tools.simulation.simulated_settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import (
+    FrameSettings,
+    SimulatedFrame,
+    simulate_frames,
+)
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 from rs_localizer.tracking import Tracker
 

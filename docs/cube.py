@@ -24,9 +24,8 @@ from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.io.video import Image
 from rs_localizer.markers.detection import MarkerDetector
-from rs_localizer.tools.simulation.renderer import Renderer
+from rs_localizer.tools.simulation.renderer import ImageSettings, Renderer
 from rs_localizer.tools.simulation.simulated_frames import frame_stamps, middle_stamp, true_poses_at
-from rs_localizer.tools.simulation.simulated_settings import ImageSettings
 from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
 from rs_localizer.tools.simulation.walls import three_walls
 

@@ -17,11 +17,6 @@ if TYPE_CHECKING:
 _PROGRAM = "rs_localizer"
 
 
-def _asks_for_help(words: list[str]) -> bool:
-    end = words.index("--") if "--" in words else len(words)
-    return not {"-h", "--help"}.isdisjoint(words[:end])
-
-
 def run() -> int:
     """Run the command of the process's arguments; Ctrl-C and SIGTERM end it with one line.
 
@@ -40,9 +35,6 @@ def run() -> int:
         code = 0
         try:
             with importing(_PROGRAM):
-                from rs_localizer import cli
-
-                cli.WORKING = not _asks_for_help(sys.argv)
                 from rs_localizer.cli.commands import main
 
             code = main(importing=importing)

@@ -29,9 +29,8 @@ from rs_localizer.io.trajectories import read_tum
 from rs_localizer.ros.node.conversion import copy_message
 from rs_localizer.settings import NODE_NAME
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.simulated_frames import simulate_frames
+from rs_localizer.tools.simulation.simulated_frames import FrameSettings, simulate_frames
 from rs_localizer.tools.simulation.simulated_imu import ImuSettings, Lever, simulate_imu
-from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
 
 _K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])

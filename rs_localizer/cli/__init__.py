@@ -23,9 +23,6 @@ from rs_localizer.io.atomic_files import atomic_files, check_writable, content
 # says that it leaked when a signal ends the command.
 tqdm.set_lock(threading.RLock())
 
-WORKING = True
-"""True where commands work: one that only shows its arguments imports no more than these need."""
-
 
 def earlier_result(
     args: Any, mark: str, place: Path | None = None, names: Sequence[str] | None = None

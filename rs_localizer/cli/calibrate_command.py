@@ -14,7 +14,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, refuse_existing, typed, write_all
+from tqdm import tqdm
+
+from rs_localizer.cli import refuse_existing, typed, write_all
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.cli.recording_input import (
     ImageOptions,
@@ -27,36 +29,32 @@ from rs_localizer.cli.recording_input import (
     recorded,
     remapped,
 )
+from rs_localizer.config import CalibrationErrors, DetectorConfig, NodeConfig
+from rs_localizer.core.camera import Camera
+from rs_localizer.io import rigs
+from rs_localizer.io.bags import BagReader, is_bag, open_bag
+from rs_localizer.io.camera_files import lens_parameters, write_calibration
+from rs_localizer.io.imu import ImuRecording
+from rs_localizer.io.maps.files import read_map_file
+from rs_localizer.io.rigs import RigParts
 from rs_localizer.io.topics import CAMERA_INFO, IMAGE, IMU
-
-if WORKING:
-    from tqdm import tqdm
-
-    from rs_localizer.config import CalibrationErrors, DetectorConfig, NodeConfig
-    from rs_localizer.core.camera import Camera
-    from rs_localizer.io import rigs
-    from rs_localizer.io.bags import BagReader, is_bag, open_bag
-    from rs_localizer.io.camera_files import lens_parameters, write_calibration
-    from rs_localizer.io.imu import ImuRecording
-    from rs_localizer.io.maps.files import read_map_file
-    from rs_localizer.io.rigs import RigParts
-    from rs_localizer.markers.map_files import write_marker_map
-    from rs_localizer.markers.maps import MarkerMap
-    from rs_localizer.offline.fleet import Figures
-    from rs_localizer.offline.recordings import optical_frame, read_imu_recording
-    from rs_localizer.offline.replay import has_frames
-    from rs_localizer.pipeline.marker_detector import FrameDetector
-    from rs_localizer.settings import build, write_parameters
-    from rs_localizer.tools import verdict
-    from rs_localizer.tools.adjust.intrinsics import LensErrors
-    from rs_localizer.tools.adjust.observe import ImagePoints, in_order
-    from rs_localizer.tools.camera_calibration import (
-        CameraCalibration,
-        calibrate,
-        calibrate_either_axis,
-    )
-    from rs_localizer.tools.first_lens import first_lens
-    from rs_localizer.tools.rig_mounts import calibrate_rig
+from rs_localizer.markers.map_files import write_marker_map
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.offline.fleet import Figures
+from rs_localizer.offline.recordings import optical_frame, read_imu_recording
+from rs_localizer.offline.replay import has_frames
+from rs_localizer.pipeline.marker_detector import FrameDetector
+from rs_localizer.settings import build, write_parameters
+from rs_localizer.tools import verdict
+from rs_localizer.tools.adjust.intrinsics import LensErrors
+from rs_localizer.tools.adjust.observe import ImagePoints, in_order
+from rs_localizer.tools.camera_calibration import (
+    CameraCalibration,
+    calibrate,
+    calibrate_either_axis,
+)
+from rs_localizer.tools.first_lens import first_lens
+from rs_localizer.tools.rig_mounts import calibrate_rig
 
 # Names of the files beside FILE.yaml, after FILE_.
 _MAP, _TRANSFORMS = "map.yaml", "transforms.launch.xml"
@@ -189,7 +187,7 @@ def _calibrated(
     if source.find_lens:
         print("\n".join(verdict.of_lens(found)))
     if source.imu is not None:
-        print("\n".join(verdict.of_imu(found, source.imu, config.stamp_offset)))
+        print("\n".join(verdict.of_imu(found, config.stamp_offset)))
     return found
 
 

@@ -15,31 +15,29 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, detect_command, simulate_command, stage, typed
+import numpy as np
+
+from rs_localizer import data
+from rs_localizer.cli import detect_command, simulate_command, stage, typed
 from rs_localizer.cli.options import option
 from rs_localizer.config import NodeConfig
-
-if WORKING:
-    import numpy as np
-
-    from rs_localizer import data
-    from rs_localizer.io.atomic_files import atomic_files
-    from rs_localizer.io.bags import open_bag
-    from rs_localizer.io.camera_info import read_camera_info
-    from rs_localizer.io.messages import stamp_ns
-    from rs_localizer.io.outputs import Localized
-    from rs_localizer.io.recording import (
-        CAMERA_INFO_TOPIC,
-        CORRESPONDENCES_TOPIC,
-        MARKER_MAP,
-        PARAMETERS,
-    )
-    from rs_localizer.io.trajectories import Motions, read_motions
-    from rs_localizer.offline.results import Track
-    from rs_localizer.pipeline.camera_frames import CameraFrames
-    from rs_localizer.settings import build, load_params_file
-    from rs_localizer.tools import errors
-    from rs_localizer.tools.simulation.simulated_settings import FrameSettings
+from rs_localizer.io.atomic_files import atomic_files
+from rs_localizer.io.bags import open_bag
+from rs_localizer.io.camera_info import read_camera_info
+from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.outputs import Localized
+from rs_localizer.io.recording import (
+    CAMERA_INFO_TOPIC,
+    CORRESPONDENCES_TOPIC,
+    MARKER_MAP,
+    PARAMETERS,
+)
+from rs_localizer.io.trajectories import Motions, read_motions
+from rs_localizer.offline.results import Track
+from rs_localizer.pipeline.camera_frames import CameraFrames
+from rs_localizer.settings import build, load_params_file
+from rs_localizer.tools import errors
+from rs_localizer.tools.simulation.simulated_frames import FrameSettings
 
 # Parts of the bundled hand's motion: start and duration, s. The flight begins slowly and ends in
 # quick turns; before the walls the hand turns about all axes, by up to 200 deg/s.

@@ -11,7 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, earlier_result, typed
+import numpy as np
+from tqdm import tqdm
+
+from rs_localizer.cli import earlier_result, typed
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.cli.recording_input import (
     ImageOptions,
@@ -23,23 +26,18 @@ from rs_localizer.cli.recording_input import (
     shutter_values,
 )
 from rs_localizer.config import DetectorConfig, FeatureConfig, FeatureKind
+from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.recording import PARAMETERS
+from rs_localizer.offline import detect as offline
+from rs_localizer.offline.detect import Extraction, record_features, record_markers
+from rs_localizer.offline.fleet import Figures
+from rs_localizer.offline.image_sources import Carried, Shot
+from rs_localizer.pipeline.keypoints import FrameExtractor
+from rs_localizer.pipeline.marker_detector import FrameDetector
 from rs_localizer.settings import build, settings, write_parameters
 
-if WORKING:
-    import numpy as np
-    from tqdm import tqdm
-
-    from rs_localizer.io.atomic_files import atomic_directory
-    from rs_localizer.offline import detect as offline
-    from rs_localizer.offline.detect import Extraction, record_features, record_markers
-    from rs_localizer.offline.fleet import Figures
-    from rs_localizer.offline.image_sources import Carried, Shot
-    from rs_localizer.pipeline.keypoints import FrameExtractor
-    from rs_localizer.pipeline.marker_detector import FrameDetector
-
-    Shots = Iterable[Shot | Carried]
+Shots = Iterable[Shot | Carried]
 
 _LEAST_KEYPOINTS = settings(FeatureConfig)["max_keypoints"].minimum or 1.0
 

@@ -7,16 +7,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, write_all
+import numpy as np
+
+from rs_localizer.cli import write_all
 from rs_localizer.cli.options import argument, option
 from rs_localizer.cli.recording_input import remapped
-
-if WORKING:
-    import numpy as np
-
-    from rs_localizer.io.trajectories import Trajectory, read_motions
-    from rs_localizer.offline.fleet import Figures
-    from rs_localizer.tools import errors
+from rs_localizer.io.trajectories import Trajectory, read_motions
+from rs_localizer.offline.fleet import Figures
+from rs_localizer.tools import errors
 
 _TOPICS = ("pose", "twist", "truth_pose", "truth_twist")
 

@@ -9,16 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from rs_localizer.cli import WORKING, read_counts, refuse_existing
+from rs_localizer.cli import read_counts, refuse_existing
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
+from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.markers.families import FAMILIES, family
+from rs_localizer.markers.map_files import write_marker_map
+from rs_localizer.markers.maps import MarkerMap, wall
+from rs_localizer.markers.prints import Charuco, Chessboard, Pose
 from rs_localizer.tools.printing import PAGES, largest_side, plan, write_pages
-
-if WORKING:
-    from rs_localizer.io.atomic_files import atomic_files
-    from rs_localizer.markers.map_files import write_marker_map
-    from rs_localizer.markers.maps import MarkerMap, wall
-    from rs_localizer.markers.prints import Charuco, Chessboard, Pose
 
 # Six markers, which fill a page. Where more would be smaller than this (m), each has a page of its
 # own: smaller ones are not seen from a few metres.

@@ -11,41 +11,39 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from rs_localizer.cli import WORKING, read_counts
+import numpy as np
+from tqdm import tqdm
+
+from rs_localizer.cli import read_counts
 from rs_localizer.cli.options import SettingOptions, TopicOptions, UsageError, option
+from rs_localizer.config import NodeConfig
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import BagReader, is_bag, open_bag
 from rs_localizer.io.camera_files import CALIBRATION_KINDS, read_calibration
+from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.image_clock import ImageClock, readout_fault
+from rs_localizer.io.images import Image
+from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.recording import PARAMETERS
 from rs_localizer.io.topics import CAMERA_INFO, IMAGE, IMU
+from rs_localizer.io.video import has_times
+from rs_localizer.markers.map_files import read_marker_map
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.markers.prints import Chessboard, Pose
+from rs_localizer.offline.detect import ImageTally, usable
+from rs_localizer.offline.image_sources import (
+    Carried,
+    Shot,
+    from_bag,
+    from_files,
+    from_video,
+    image_files,
+    name_times,
+)
+from rs_localizer.offline.recordings import optical_frame, read_recording
+from rs_localizer.offline.replay import camera_topics, find_topics
 from rs_localizer.pipeline.inputs import CAMERA_INFO_TYPE, IMAGE_TYPES, INPUTS
 from rs_localizer.settings import build, camera_values, load_params_file, parse_assignment
-
-if WORKING:
-    import numpy as np
-    from tqdm import tqdm
-
-    from rs_localizer.config import NodeConfig
-    from rs_localizer.core.camera import Camera
-    from rs_localizer.io.bags import BagReader, is_bag, open_bag
-    from rs_localizer.io.clouds import Correspondences
-    from rs_localizer.io.images import Image
-    from rs_localizer.io.maps.landmarks import Map
-    from rs_localizer.io.video import has_times
-    from rs_localizer.markers.map_files import read_marker_map
-    from rs_localizer.markers.maps import MarkerMap
-    from rs_localizer.markers.prints import Chessboard, Pose
-    from rs_localizer.offline.detect import ImageTally, usable
-    from rs_localizer.offline.image_sources import (
-        Carried,
-        Shot,
-        from_bag,
-        from_files,
-        from_video,
-        image_files,
-        name_times,
-    )
-    from rs_localizer.offline.recordings import optical_frame, read_recording
-    from rs_localizer.offline.replay import camera_topics, find_topics
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,35 +10,28 @@ import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
-from rs_localizer.cli import WORKING, earlier_result, refuse_existing
+from tqdm import tqdm
+
+from rs_localizer.cli import detect_command, earlier_result, refuse_existing
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.cli.recording_input import ImageOptions, given_topics, given_values
+from rs_localizer.config import ImuUse, NodeConfig
+from rs_localizer.features.extraction import kind_of
 from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import is_bag, open_bag
-from rs_localizer.io.recording import BRIDGED, RESULT
+from rs_localizer.io.maps.files import read_map_file
+from rs_localizer.io.recording import BRIDGED, CAMERA, MAP, MAP_FRAME, PARAMETERS, RESULT
+from rs_localizer.io.topics import IMU
 from rs_localizer.io.trajectories import POSES_FILE as POSES
 from rs_localizer.io.trajectories import TWISTS_FILE as TWISTS
-
-if WORKING:
-    from tqdm import tqdm
-
-    from rs_localizer.config import ImuUse, NodeConfig
-    from rs_localizer.features.extraction import kind_of
-    from rs_localizer.io.maps.files import read_map_file
-    from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
-    from rs_localizer.io.topics import IMU
-    from rs_localizer.markers.map_files import is_marker_file
-    from rs_localizer.offline import fleet, frame_table
-    from rs_localizer.offline.fleet import Figures, Outcome, Task
-    from rs_localizer.offline.image_sources import holds_images, image_topics
-    from rs_localizer.offline.replay import has_frames, imu_topics, prepare_replay
-    from rs_localizer.offline.results import Smooth, Tally, figures, summary, write_results
-    from rs_localizer.settings import build
-
-if TYPE_CHECKING:
-    from rs_localizer.cli import detect_command  # of images only
+from rs_localizer.markers.map_files import is_marker_file
+from rs_localizer.offline import fleet, frame_table
+from rs_localizer.offline.fleet import Figures, Outcome, Task
+from rs_localizer.offline.image_sources import holds_images, image_topics
+from rs_localizer.offline.replay import has_frames, imu_topics, prepare_replay
+from rs_localizer.offline.results import Smooth, Tally, figures, summary, write_results
+from rs_localizer.settings import build
 
 # The table of each of many recordings.
 TABLE = "frames.parquet"
@@ -119,8 +112,6 @@ def _replay_one(options: Options, recording: Path, out: Path, timed: bool = True
         raise ValueError(
             f"{recording} {pictures}, not matches: give --map, of markers or landmarks{lens}"
         )
-    from rs_localizer.cli import detect_command
-
     with TemporaryDirectory() as place:
         matches = Path(place) / "matches"
         of_images = _detection(options, recording, options.map, matches)
@@ -137,8 +128,6 @@ def _replay_one(options: Options, recording: Path, out: Path, timed: bool = True
 
 def _detection(options: Options, recording: Path, place: Path, out: Path) -> detect_command.Options:
     """Return the options of ``detect`` that find the matches of images with the map ``place``."""
-    from rs_localizer.cli import detect_command
-
     by_markers = is_marker_file(place)
     calibration, params = options.calibration, options.params
     if (place / MAP).is_file():  # a result of map build; a bag has a lens of its own

@@ -10,62 +10,65 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING, earlier_result, typed
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from rs_localizer import data
+from rs_localizer.cli import earlier_result, typed
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.io.atomic_files import atomic_directory
+from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.camera_files import pinhole_matrix, read_calibration
+from rs_localizer.io.maps.files import write_npz
+from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.recording import MAP, MAP_FRAME, MARKER_MAP, PARAMETERS
 from rs_localizer.io.rigs import read_camchain
 from rs_localizer.io.topics import TF_STATIC
+from rs_localizer.io.trajectories import read_tum
+from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.settings import build, camera_values, settings, write_parameters
-from rs_localizer.tools.simulation.simulated_settings import FrameSettings, ImageSettings
+from rs_localizer.tools.simulation.renderer import (
+    ImageSettings,
+    RenderedFrame,
+    Renderer,
+    rendered_frames,
+)
+from rs_localizer.tools.simulation.scene import room
+from rs_localizer.tools.simulation.simulated_frames import (
+    FrameSettings,
+    SimulatedFrame,
+    frame_stamps,
+    middle_stamp,
+    simulate_frames,
+)
+from rs_localizer.tools.simulation.simulated_imu import (
+    ImuSettings,
+    Lever,
+    shaken,
+    simulate_imu,
+    write_imu,
+)
+from rs_localizer.tools.simulation.simulated_recording import (
+    camera_stamps,
+    keypoint_rows,
+    make_mounts,
+    random_descriptors,
+    rig_parameters,
+    simulate_rig,
+    write_rig_frame,
+    write_simulated,
+)
+from rs_localizer.tools.simulation.true_motion import (
+    ConstantVelocity,
+    RecordedMotion,
+    TrueMotion,
+    sampled_states,
+)
 from rs_localizer.tools.simulation.walls import SCENES, Scene
-
-if WORKING:
-    import numpy as np
-    from numpy.typing import NDArray
-    from tqdm import tqdm
-
-    from rs_localizer import data
-    from rs_localizer.core.arrays import Array
-    from rs_localizer.io.atomic_files import atomic_directory
-    from rs_localizer.io.bags import BagWriter
-    from rs_localizer.io.maps.files import write_npz
-    from rs_localizer.io.maps.landmarks import Map
-    from rs_localizer.io.trajectories import read_tum
-    from rs_localizer.markers.map_files import write_marker_map
-    from rs_localizer.tools.simulation.renderer import RenderedFrame, Renderer, rendered_frames
-    from rs_localizer.tools.simulation.scene import room
-    from rs_localizer.tools.simulation.simulated_frames import (
-        SimulatedFrame,
-        frame_stamps,
-        middle_stamp,
-        simulate_frames,
-    )
-    from rs_localizer.tools.simulation.simulated_imu import (
-        ImuSettings,
-        Lever,
-        shaken,
-        simulate_imu,
-        write_imu,
-    )
-    from rs_localizer.tools.simulation.simulated_recording import (
-        camera_stamps,
-        keypoint_rows,
-        make_mounts,
-        random_descriptors,
-        rig_parameters,
-        simulate_rig,
-        write_rig_frame,
-        write_simulated,
-    )
-    from rs_localizer.tools.simulation.true_motion import (
-        ConstantVelocity,
-        RecordedMotion,
-        TrueMotion,
-        sampled_states,
-    )
 
 # A still hand is no example: without any motion given, the camera turns and walks like this.
 _ANGULAR_VELOCITY, _LINEAR_VELOCITY = (0.0, 1.0, 0.0), (0.3, 0.0, 0.0)

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from rs_localizer.core import so3
 from rs_localizer.io.reading import dump_yaml, file_faults, load_yaml, read_text
 from rs_localizer.markers import prints
 from rs_localizer.markers.families import FAMILIES, Family, family
@@ -224,8 +225,6 @@ def _board_entry(board: prints.Board) -> dict[str, Any]:
 
 
 def _pose_entry(pose: prints.Pose) -> dict[str, Any]:
-    from rs_localizer.core import so3  # kernels: a command that shows its help imports none
-
     quaternion = so3.quaternion(np.ascontiguousarray(pose.rotation))
     return {"position": _rounded(pose.position), "quaternion": _rounded(quaternion)}
 

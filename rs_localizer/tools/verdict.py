@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.scanning import REVERSED, ScanDirection
-from rs_localizer.io.imu import ImuRecording
 from rs_localizer.tools.camera_calibration import CameraCalibration
 from rs_localizer.tools.rig_mounts import Mounted
 
@@ -21,10 +20,9 @@ _REGIONS = (
     "top left", "top", "top right", "left", "middle", "right", "bottom left", "bottom",
     "bottom right",
 )  # fmt: skip
-# A rotation that TF has otherwise by more than this (degrees), and more than chance, is doubted.
-_MOST_TURN, _SIGMAS = 1.0, 4.0
-# Corners that are bent by less (px) are those of a rectified film, or of a telephoto lens.
-_STRAIGHT = 1.5
+# Corners that are bent by less (px, deviations) are those of a rectified film, or of a telephoto
+# lens.
+_STRAIGHT, _SIGMAS = 1.5, 4.0
 
 
 def readout_time(result: CameraCalibration) -> float:
@@ -148,7 +146,7 @@ def _straightness(found: CameraCalibration) -> str:
     )
 
 
-def of_imu(found: CameraCalibration, imu: ImuRecording, stamp_offset: float) -> Iterator[str]:
+def of_imu(found: CameraCalibration, stamp_offset: float) -> Iterator[str]:
     """Yield rows of the table, and sentences on oddities."""
     one = found.mount
     if one is None:
@@ -170,15 +168,6 @@ def of_imu(found: CameraCalibration, imu: ImuRecording, stamp_offset: float) -> 
             f"imu: parts of the recording have different offsets: the deviation is "
             f"{one.inflation:.1f} times that of the noise alone"
         )
-    if imu.camera_from_imu is None:
-        yield "imu: TF has no transform from it to the camera; its rotation is not checked"
-    elif one.determined[1]:
-        off = np.degrees(one.mount.turned_from(imu.camera_from_imu))
-        chance = _SIGMAS * float(np.degrees(np.linalg.norm(one.rotation_deviations)))
-        if off > max(_MOST_TURN, chance):
-            yield f"imu: TF has another rotation, {off:.1f} deg off: is it right?"
-        else:
-            yield f"imu: TF agrees with the rotation to {off:.2f} deg"
 
 
 def of_mount(name: str, first: str, found: Mounted) -> Iterator[str]:

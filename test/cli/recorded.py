@@ -17,8 +17,11 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.imu import make_reading
 from rs_localizer.io.transforms import Transform, make_transform
-from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, simulate_frames
-from rs_localizer.tools.simulation.simulated_settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import (
+    FrameSettings,
+    SimulatedFrame,
+    simulate_frames,
+)
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03

@@ -23,9 +23,8 @@ from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.prints import Marker, Pose
 from rs_localizer.tools.mapping.gauge import through
-from rs_localizer.tools.simulation.renderer import Renderer
+from rs_localizer.tools.simulation.renderer import ImageSettings, Renderer
 from rs_localizer.tools.simulation.simulated_frames import frame_stamps
-from rs_localizer.tools.simulation.simulated_settings import ImageSettings
 from rs_localizer.tools.simulation.true_motion import RecordedMotion, sampled_states
 from rs_localizer.tools.simulation.walls import Scene, printed, room
 

@@ -20,8 +20,8 @@ from rs_localizer.io.outputs import TYPES, Localized
 from rs_localizer.io.trajectories import read_motions, read_tum, read_twists
 from rs_localizer.offline import results
 from rs_localizer.tools.simulation.scene import room
+from rs_localizer.tools.simulation.simulated_frames import FrameSettings
 from rs_localizer.tools.simulation.simulated_recording import write_simulated
-from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 
 FRAMES = 6
 # Nanoseconds since 1970 that a float of seconds cannot hold.

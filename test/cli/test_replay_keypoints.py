@@ -14,12 +14,12 @@ from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_motions, read_tum
 from rs_localizer.tools.simulation.scene import room
+from rs_localizer.tools.simulation.simulated_frames import FrameSettings
 from rs_localizer.tools.simulation.simulated_recording import (
     keypoint_rows,
     random_descriptors,
     write_simulated,
 )
-from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 
 FRAMES = 8
 POINTS = room(np.zeros((1, 3)), np.random.default_rng(0), count=6000)

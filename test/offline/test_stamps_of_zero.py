@@ -11,7 +11,7 @@ from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.offline.replay import prepare_replay, replay
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.simulated_settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import FrameSettings
 
 from ..pipeline.clouds import cloud_of  # noqa: TID252 - Python has a package "test"
 

@@ -16,7 +16,7 @@ from rs_localizer.io.rigs import RigParts
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import write_parameters
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.simulated_frames import simulate_frames
+from rs_localizer.tools.simulation.simulated_frames import FrameSettings, simulate_frames
 from rs_localizer.tools.simulation.simulated_recording import (
     RigFrame,
     camera_stamps,
@@ -25,7 +25,6 @@ from rs_localizer.tools.simulation.simulated_recording import (
     simulate_rig,
     write_rig_frame,
 )
-from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity, RecordedMotion, TrueMotion
 
 K = np.array([[450.0, 0.0, 319.5], [0.0, 450.0, 239.5], [0.0, 0.0, 1.0]])

@@ -23,8 +23,11 @@ from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.pipeline.rig_frames import RigFrames
 from rs_localizer.settings import build, camera_values, write_parameters
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, simulate_frames
-from rs_localizer.tools.simulation.simulated_settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import (
+    FrameSettings,
+    SimulatedFrame,
+    simulate_frames,
+)
 from rs_localizer.tools.simulation.true_motion import (
     ConstantVelocity,
     RecordedMotion,

@@ -20,9 +20,12 @@ from rs_localizer.matching import Matcher
 from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, simulate_frames
+from rs_localizer.tools.simulation.simulated_frames import (
+    FrameSettings,
+    SimulatedFrame,
+    simulate_frames,
+)
 from rs_localizer.tools.simulation.simulated_recording import keypoint_rows, random_descriptors
-from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03

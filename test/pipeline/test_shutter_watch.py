@@ -30,8 +30,7 @@ from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.shutter_watch import MeasuredReadout, ShutterWatch
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.simulated_frames import simulate_frames
-from rs_localizer.tools.simulation.simulated_settings import FrameSettings
+from rs_localizer.tools.simulation.simulated_frames import FrameSettings, simulate_frames
 from rs_localizer.tools.simulation.true_motion import (
     ConstantVelocity,
     RecordedMotion,

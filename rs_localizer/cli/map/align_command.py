@@ -7,18 +7,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, refuse_existing, write_all
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.cli import refuse_existing, write_all
 from rs_localizer.cli.map import info_command
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.io.maps.files import SUFFIX, write_npz
+from rs_localizer.io.maps.landmarks import Map, make_map
 from rs_localizer.markers.map_files import write_marker_map
-
-if WORKING:
-    import numpy as np
-    from scipy.spatial.transform import Rotation
-
-    from rs_localizer.io.maps.landmarks import Map, make_map
-    from rs_localizer.tools.mapping.gauge import alignment, moved_map
+from rs_localizer.tools.mapping.gauge import alignment, moved_map
 
 _OUTPUTS = (SUFFIX, ".yaml", ".yml")
 

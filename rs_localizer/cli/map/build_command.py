@@ -11,7 +11,9 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from rs_localizer.cli import WORKING, earlier_result, stage, typed
+from tqdm import tqdm
+
+from rs_localizer.cli import earlier_result, stage, typed
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, number, option
 from rs_localizer.cli.recording_input import (
     ImageOptions,
@@ -21,20 +23,16 @@ from rs_localizer.cli.recording_input import (
     shutter_values,
 )
 from rs_localizer.config import FeatureConfig
-
-if WORKING:
-    from tqdm import tqdm
-
-    from rs_localizer.io.atomic_files import atomic_directory
-    from rs_localizer.io.camera_files import lens_parameters
-    from rs_localizer.io.maps.files import write_npz
-    from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME
-    from rs_localizer.io.trajectories import Trajectory, write_tum
-    from rs_localizer.markers.map_files import read_marker_map
-    from rs_localizer.settings import build, write_parameters
-    from rs_localizer.tools.mapping.anchors import Anchors, Distance, PointSight
-    from rs_localizer.tools.mapping.build import Built, Given, build_map, result_rows
-    from rs_localizer.tools.mapping.structure import Looked, Looker, look_through, require
+from rs_localizer.io.atomic_files import atomic_directory
+from rs_localizer.io.camera_files import lens_parameters
+from rs_localizer.io.maps.files import write_npz
+from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME
+from rs_localizer.io.trajectories import Trajectory, write_tum
+from rs_localizer.markers.map_files import read_marker_map
+from rs_localizer.settings import build, write_parameters
+from rs_localizer.tools.mapping.anchors import Anchors, Distance, PointSight
+from rs_localizer.tools.mapping.build import Built, Given, build_map, result_rows
+from rs_localizer.tools.mapping.structure import Looked, Looker, look_through, require
 
 
 def shutter_of(args: Options) -> tuple[float | None, str | None]:

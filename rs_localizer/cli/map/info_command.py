@@ -8,18 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.cli import WORKING
+import numpy as np
+
 from rs_localizer.cli.options import UsageError, argument, option
 from rs_localizer.io.maps.files import read_map_file
+from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.recording import MAP_FRAME
+from rs_localizer.markers.families import family
 from rs_localizer.markers.map_files import FORMATS, USUAL_FAMILY, is_marker_file, read_any
-
-if WORKING:
-    import numpy as np
-
-    from rs_localizer.io.maps.landmarks import Map
-    from rs_localizer.markers.families import family
-    from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.markers.maps import MarkerMap
 
 Figures = dict[str, Any]
 """Printed figures, and those of ``--json``: identifiers, with their units."""

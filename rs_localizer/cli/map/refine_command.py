@@ -10,7 +10,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, earlier_result, refuse_existing, write_all
+import numpy as np
+from tqdm import tqdm
+
+from rs_localizer.cli import earlier_result, refuse_existing, write_all
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.cli.recording_input import (
     LensOptions,
@@ -19,22 +22,17 @@ from rs_localizer.cli.recording_input import (
     given_values,
     recorded,
 )
+from rs_localizer.io.atomic_files import atomic_directory
+from rs_localizer.io.bags import open_bag
+from rs_localizer.io.camera_files import write_calibration
+from rs_localizer.io.maps.colmap import read_model, write_model
 from rs_localizer.io.maps.files import SUFFIX, read_map_file, write_npz
-
-if WORKING:
-    import numpy as np
-    from tqdm import tqdm
-
-    from rs_localizer.io.atomic_files import atomic_directory
-    from rs_localizer.io.bags import open_bag
-    from rs_localizer.io.camera_files import write_calibration
-    from rs_localizer.io.maps.colmap import read_model, write_model
-    from rs_localizer.io.maps.landmarks import Map, MapError
-    from rs_localizer.offline.image_sources import name_times
-    from rs_localizer.settings import build
-    from rs_localizer.tools.mapping.global_shutter import GlobalShutterModel, undo_shutter
-    from rs_localizer.tools.mapping.map_keypoints import MapFreedom, RecordedMap, from_recording
-    from rs_localizer.tools.mapping.refinement import RefinedMap, refine
+from rs_localizer.io.maps.landmarks import Map, MapError
+from rs_localizer.offline.image_sources import name_times
+from rs_localizer.settings import build
+from rs_localizer.tools.mapping.global_shutter import GlobalShutterModel, undo_shutter
+from rs_localizer.tools.mapping.map_keypoints import MapFreedom, RecordedMap, from_recording
+from rs_localizer.tools.mapping.refinement import RefinedMap, refine
 
 _step = partial(print, "adjusted:", flush=True)
 

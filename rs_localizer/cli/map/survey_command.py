@@ -8,21 +8,19 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from rs_localizer.cli import WORKING, refuse_existing, write_all
+import numpy as np
+
+from rs_localizer.cli import refuse_existing, write_all
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.cli.recording_input import ImageOptions, each_image, given_settings
+from rs_localizer.config import NodeConfig
+from rs_localizer.core.camera import Camera
 from rs_localizer.markers.families import FAMILIES, Family, family
-
-if WORKING:
-    import numpy as np
-
-    from rs_localizer.config import NodeConfig
-    from rs_localizer.core.camera import Camera
-    from rs_localizer.markers.map_files import write_marker_map
-    from rs_localizer.markers.maps import MarkerMap
-    from rs_localizer.markers.prints import Marker
-    from rs_localizer.tools.mapping.survey import MISFIT, Survey, survey
-    from rs_localizer.tools.mapping.unknown_markers import Filmed, Spotted, Spotter, every_marker
+from rs_localizer.markers.map_files import write_marker_map
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.markers.prints import Marker
+from rs_localizer.tools.mapping.survey import MISFIT, Survey, survey
+from rs_localizer.tools.mapping.unknown_markers import Filmed, Spotted, Spotter, every_marker
 
 _LISTED = 12
 

@@ -74,11 +74,6 @@ class GyroMount:
         turn = so3.log(np.ascontiguousarray(first.camera_from_imu.T @ self.camera_from_imu))
         return np.asarray(np.r_[turn, self.bias - first.bias, self.delay - first.delay, self.shape])
 
-    def turned_from(self, given: Array) -> float:
-        """Return the angle (rad) between its rotation and a given one (3,3)."""
-        between = np.ascontiguousarray(given.T @ self.camera_from_imu)
-        return float(np.linalg.norm(so3.log(between)))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SplineKeypoints:

@@ -21,9 +21,16 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.video import Image
 from rs_localizer.tools.simulation.render_kernels import render_lines
 from rs_localizer.tools.simulation.simulated_frames import middle_stamp
-from rs_localizer.tools.simulation.simulated_settings import ImageSettings
 from rs_localizer.tools.simulation.true_motion import TrueMotion, TrueState
 from rs_localizer.tools.simulation.walls import TexturedPlane
+
+
+@dataclass(frozen=True, slots=True)
+class ImageSettings:
+    """Faults of the sensor."""
+
+    exposure: float = 0.0  # s that each row is exposed, around its row time; 0: an instant
+    noise: float = 0.0  # standard deviation of a grey level (of 255)
 
 
 def pyramids(planes: Sequence[TexturedPlane]) -> tuple[Image, NDArray[np.int64]]:

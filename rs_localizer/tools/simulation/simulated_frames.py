@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import TrueMotion, TrueState
 
 # No points closer than this (m): a lens sees them as a blur.
@@ -29,6 +28,16 @@ _FOLD_TOLERANCE = 1e-3
 _VIEW_MARGIN = 0.15
 # Row times beyond this are of no interest (the image ends at 0.5).
 _FARTHEST_ROW = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSettings:
+    """Points of each frame, and how badly they are seen."""
+
+    points: int = 150  # at most; fewer where the map shows fewer
+    noise: float = 1.0  # standard deviation of u and of v, raw pixels
+    outliers: float = 0.3  # share of the points whose pixel is uniform in the image
+    rate: float = 30.0  # frames per second
 
 
 @dataclass(frozen=True, slots=True, eq=False)

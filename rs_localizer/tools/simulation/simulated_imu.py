@@ -21,8 +21,7 @@ from rs_localizer.io.imu import make_reading
 from rs_localizer.io.recording import CAMERA_FRAME
 from rs_localizer.io.topics import TF_STATIC
 from rs_localizer.io.transforms import Transform, make_transform
-from rs_localizer.tools.simulation.simulated_settings import BODY_FROM_CAMERA
-from rs_localizer.tools.simulation.true_motion import TrueMotion, TrueState
+from rs_localizer.tools.simulation.true_motion import BODY_FROM_CAMERA, TrueMotion, TrueState
 
 _GRAVITY = np.array([0.0, 0.0, -9.80665])  # m/s^2, in a map with z up
 _STEP = 1e-5  # s, of the difference that gives accelerations

@@ -16,8 +16,9 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.trajectories import Trajectory, split_at_gaps
-from rs_localizer.tools.simulation.simulated_settings import BODY_FROM_CAMERA
 
+BODY_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Camera axes (x right, y down, z forward) in those of REP-103's body, x forward and z up."""
 # Motion capture at 100 Hz and more shakes by a few tenths of a degree from sample to sample: a
 # spline through every sample turns that into accelerations that no hand has (0.24 degrees median,
 # 8 at worst, off constant velocity in 30 ms on TUM VI room5; 0.04 and 0.27 with knots of 50 ms).

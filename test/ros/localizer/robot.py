@@ -23,9 +23,8 @@ from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.ros.node.conversion import copy_message, message_class
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.simulated_frames import simulate_frames
+from rs_localizer.tools.simulation.simulated_frames import FrameSettings, simulate_frames
 from rs_localizer.tools.simulation.simulated_recording import write_simulated
-from rs_localizer.tools.simulation.simulated_settings import FrameSettings
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03

@@ -10,8 +10,7 @@ import pytest
 
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
-from rs_localizer.tools.simulation.renderer import Renderer
-from rs_localizer.tools.simulation.simulated_settings import ImageSettings
+from rs_localizer.tools.simulation.renderer import ImageSettings, Renderer
 from rs_localizer.tools.simulation.true_motion import ConstantVelocity
 from rs_localizer.tools.simulation.walls import TexturedPlane
 

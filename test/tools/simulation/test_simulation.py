@@ -13,14 +13,19 @@ from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import (
+    FrameSettings,
     SimulatedFrame,
     frame_stamps,
     simulate_frames,
 )
 from rs_localizer.tools.simulation.simulated_imu import shaken
 from rs_localizer.tools.simulation.simulated_recording import MountedMotion
-from rs_localizer.tools.simulation.simulated_settings import BODY_FROM_CAMERA, FrameSettings
-from rs_localizer.tools.simulation.true_motion import ConstantVelocity, RecordedMotion, TrueMotion
+from rs_localizer.tools.simulation.true_motion import (
+    BODY_FROM_CAMERA,
+    ConstantVelocity,
+    RecordedMotion,
+    TrueMotion,
+)
 
 K = np.array([[400.0, 0.0, 319.5], [0.0, 410.0, 239.5], [0.0, 0.0, 1.0]])
 MOTION = ConstantVelocity(np.array([0.6, -2.0, 1.5]), np.array([1.0, 0.5, 0.25]), 1.0)
