@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -98,15 +97,9 @@ def detect(args: Options) -> Figures:
                 count, median = len(found.counts), float(np.median(found.counts))
                 kind = "keypoints" if args.features else "corners"
                 figures: Figures = {"images": found.images, f"with_{kind}": count, kind: median}
-                if not args.features:
-                    figures["residual_of_a_still_pose_px"] = found.residual
                 every.append(figures)
                 kind += f" ({args.features})" if args.features else ""
                 said = f"{count} of {found.images} images, {median:.0f} {kind} each (median)"
-                if np.isfinite(found.residual):
-                    said += (
-                        f", within {found.residual:.3f} px rms of a global-shutter pose (median)"
-                    )
                 print(f"{f'{args.out}, {name}' if name else args.out}: {said}")
                 print("".join(f"note {note}\n" for note in found.notes), end="")
                 if kept := [f"{topic} ({count})" for topic, count in found.carried.items()]:
@@ -123,8 +116,7 @@ def detect(args: Options) -> Figures:
 
 # Worst values of several cameras.
 _WORST: dict[str, Any] = {
-    "images": sum, "with_corners": sum, "corners": min, "residual_of_a_still_pose_px": max,
-    "with_keypoints": sum, "keypoints": min,
+    "images": sum, "with_corners": sum, "corners": min, "with_keypoints": sum, "keypoints": min,
 }  # fmt: skip
 
 
@@ -143,10 +135,7 @@ def _of_markers(args: Options) -> tuple[Mapping[str, float], Detection]:
     ) -> Extraction:
         notices: Counter[str] = Counter()
         detector = FrameDetector(config, lambda _, text: notices.update([text]), marker_map)
-        found = record_markers(
-            shots, detector, bag, options, done=bar.update,
-            tell=lambda text: bar.write(f"note: {text}", file=sys.stderr),
-        )  # fmt: skip
+        found = record_markers(shots, detector, bag, options, bar.update)
         texts = notices.most_common(3)
         found.notes = tuple(f"({number} images): {text}" for text, number in texts)
         return found

@@ -3,14 +3,12 @@
 """Offline detection: images -> a recording of correspondences or keypoints, as the nodes do."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import cv2
 import numpy as np
 
-from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.scanning import ScanDirection
@@ -24,22 +22,13 @@ from rs_localizer.io.recording import (
     IMAGE_TOPIC,
     KEYPOINTS_TOPIC,
 )
+from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.prints import Chessboard
 from rs_localizer.offline.image_sources import Carried, Shot
 from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
-from rs_localizer.pipeline.marker_detector import Detected, FrameDetector, correspondences
+from rs_localizer.pipeline.marker_detector import FrameDetector, correspondences
 from rs_localizer.pipeline.refusal import Refusal
 
-# Fewer corners than this say nothing about how well a pose fits.
-_LEAST_CORNERS = 6
-# Fewer than this share of the images with anything of the map are a reason to tell.
-_FEW = 0.3
-# After this many images without the map, a few seconds of a video, chance is excluded.
-_PATIENCE = 64
-# A global-shutter pose leaves at most so much (px rms) in the stillest images, in percent of all,
-# unless calibration or map are wrong: a good one leaves 0.1 to 0.5. No readout takes longer than
-# the time between two images: who leaves less than what moved between them may just have moved.
-_MOST_STILL, _STILL_PERCENT = 1.5, 10.0
 # If none fits, this many images of another size than the calibration's are no stray ones.
 _MISFITS = 3
 
@@ -65,7 +54,6 @@ class Extraction(ImageTally):
 
     counts: list[int] = field(default_factory=list)  # keypoints or corners, where there are any
     carried: Counter[str] = field(default_factory=Counter)  # messages of other topics
-    residual: float = np.nan  # px rms of a global-shutter pose, median; NaN where none was possible
     faults: tuple[str, ...] = ()  # what speaks against map or calibration
     notes: tuple[str, ...] = ()  # what the detector says of some images
 
@@ -81,38 +69,57 @@ class DetectionOptions:
 
 def record_markers(
     shots: Iterable[Shot | Carried], detector: FrameDetector, bag: BagWriter,
-    options: DetectionOptions, *, done: Callable[[], object] = lambda: None,
-    tell: Callable[[str], object] = lambda text: None,
+    options: DetectionOptions, done: Callable[[], object] = lambda: None,
 ) -> Extraction:  # fmt: skip
     """Write the corners of all images that show any, each with its CameraInfo.
 
     Args:
         shots: the images, and what else of their recording is to be kept.
         done: called after each image.
-        tell: called if many images at the beginning show nothing, with what they show instead.
 
     Raises:
         ValueError: when no image shows anything, or images and calibration differ in size.
     """
-    found = Extraction()
-    tally = _MarkerTally(detector, found)
-    for shot, image, camera in usable(
-        _kept(shots, bag, found), options.scan_direction, found, done
-    ):
-        assert camera is not None
+    found, others, faults = Extraction(), Counter[str](), Counter[str]()
+    kept = _kept(shots, bag, found)
+    for shot, image, _ in usable(kept, options.scan_direction, found, done):
         detected = detector.detect(image)
-        tally.add(camera, detected)
-        if len(detected.detections.ids):
+        others.update(detected.detections.unknown)
+        faults.update(detected.detections.faults)
+        if count := len(detected.detections.ids):
+            found.counts.append(count)
             corners = correspondences(detected, make_message)
             _write(bag, shot, CORRESPONDENCES_TOPIC, corners, options)
-        # So few may show another board in part.
-        if found.images == _PATIENCE and len(found.counts) < _FEW * found.images:
-            count = len(found.counts) or "none"
-            tell(f"{count} of the first {_PATIENCE} images {tally.nothing()}")
     if not found.counts:
         of = f" of {options.camera}" if options.camera else ""
-        raise ValueError(f"none of the {found.images} images{of} {tally.nothing()}")
-    return tally.recorded()
+        why = detector.mistake or _nothing_seen(detector.map, found.refused, faults, others)
+        raise ValueError(
+            f"none of the {found.images} images{of} shows anything of the map "
+            f"({_wanted(detector.map)}){why and '; '}{why}"
+        )
+    found.faults = tuple(filter(None, [detector.mistake]))
+    return found
+
+
+def _wanted(marker_map: MarkerMap) -> str:
+    families = sorted({marker.family.name for marker in marker_map.markers})
+    return ", ".join([*families, *(board.name for board in marker_map.boards)])
+
+
+def _nothing_seen(
+    marker_map: MarkerMap, refused: Mapping[str, str], faults: Counter[str], others: Counter[str]
+) -> str:
+    """Describe what images show that show nothing of the map; '' if that is nothing."""
+    if refused:
+        return "; ".join(refused.values())
+    if faults:
+        return faults.most_common(1)[0][0]
+    if others:
+        names = ", ".join(name for name, _ in others.most_common(5))
+        return f"they show {names}, which the map does not have"
+    if any(isinstance(board, Chessboard) for board in marker_map.boards):
+        return "are these its inner corners, and is all of it in view?"
+    return ""
 
 
 def _kept(shots: Iterable[Shot | Carried], bag: BagWriter, found: Extraction) -> Iterator[Shot]:
@@ -163,74 +170,6 @@ def usable(
                 )
             yield shot, image, camera
         done()
-
-
-class _MarkerTally:
-    """Counts the parts of a map that images show."""
-
-    def __init__(self, detector: FrameDetector, found: Extraction) -> None:
-        marker_map = detector.map
-        self._detector, self._map, self._found = detector, marker_map, found
-        self._others: Counter[str] = Counter()
-        self._faults: Counter[str] = Counter()
-        self._residuals: list[float] = []
-        self._telling: list[float] = []  # those that are not of motion during the readout
-        self._before: dict[tuple[float, ...], Array] = {}  # pixels of the image before, by point
-
-    def add(self, camera: Camera, detected: Detected) -> None:
-        detections = detected.detections
-        self._others.update(detections.unknown)
-        self._faults.update(detections.faults)
-        if len(detections.ids):
-            self._found.counts.append(len(detections.ids))
-            residual = static_residual(camera, detected)
-            self._residuals.append(residual)
-            moved = self._moved(detected)
-            if residual <= _MOST_STILL or moved < residual:
-                self._telling.append(residual)
-
-    def _moved(self, detected: Detected) -> float:
-        """Return the motion (px rms) since the image before; infinite where it is unknown."""
-        points, pixels = detected.detections.points, detected.detections.pixels
-        now = dict(zip(map(tuple, points.tolist()), pixels, strict=True))
-        before, self._before = self._before, now
-        moved = [now[point] - before[point] for point in now.keys() & before.keys()]
-        return float(np.sqrt(np.mean(np.sum(np.square(moved), axis=1)))) if moved else np.inf
-
-    def nothing(self) -> str:
-        """Describe images that show nothing of the map."""
-        families = sorted({marker.family.name for marker in self._map.markers})
-        wanted = ", ".join([*families, *(board.name for board in self._map.boards)])
-        text = f"shows anything of the map ({wanted})"
-        if self._detector.mistake:
-            return f"{text}; {self._detector.mistake}"
-        if self._found.refused:
-            text += f"; {'; '.join(self._found.refused.values())}"
-        if self._faults:
-            return f"{text}; {self._faults.most_common(1)[0][0]}"
-        if self._others:
-            names = ", ".join(name for name, _ in self._others.most_common(5))
-            return f"{text}; they show {names}, which the map does not have"
-        if any(isinstance(board, Chessboard) for board in self._map.boards):
-            return f"{text}; are these its inner corners, and is all of it in view?"
-        return text
-
-    def recorded(self) -> Extraction:
-        known = [value for value in self._residuals if np.isfinite(value)]
-        faults = list[str]()
-        if mistake := self._detector.mistake:
-            faults.append(mistake)
-        elif (telling := self._telling) and (
-            least := float(np.percentile(telling, _STILL_PERCENT))
-        ) > _MOST_STILL:
-            faults.append(
-                f"even the stillest images leave {least:.1f} px rms: the calibration can hardly be "
-                "of this camera in this mode, or the map (sizes, positions) is wrong"
-            )
-        self._found.faults = tuple(faults)
-        if known:
-            self._found.residual = float(np.median(known))
-        return self._found
 
 
 class _Cameras:
@@ -286,22 +225,6 @@ def _write(bag: BagWriter, shot: Shot, topic: str, message: Any, options: Detect
     bag.write(own + topic, message, shot.recorded_ns)
     if options.with_images and shot.compressed is not None:
         bag.write(own + IMAGE_TOPIC, shot.compressed, shot.recorded_ns)
-
-
-def static_residual(camera: Camera, detected: Detected) -> float:
-    """Return the error (px rms) of the best global-shutter pose; NaN if there is none."""
-    detections = detected.detections
-    if len(detections.ids) < _LEAST_CORNERS:
-        return np.nan
-    points, rays = detections.points, np.ascontiguousarray(camera.rays(detections.pixels))
-    try:
-        solved, turn, shift = cv2.solvePnP(points, rays, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
-    except cv2.error:
-        return np.nan
-    if not solved:
-        return np.nan
-    seen = camera.project(points @ np.asarray(cv2.Rodrigues(turn)[0]).T + np.ravel(shift))
-    return float(np.sqrt(np.mean(np.sum((seen - detections.pixels) ** 2, axis=1))))
 
 
 def record_features(
