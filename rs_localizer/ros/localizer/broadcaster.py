@@ -172,7 +172,7 @@ class Broadcaster:
         self._flush()
 
     def _tell_rival(self, item: Any, static: bool) -> None:
-        if text := self._rivals.hear(item, self.decision, static=static):
+        if text := self._rivals.hear(item, static=static):
             self._refusals.notice(Notice.SECOND_BROADCASTER, text)
 
     def _flush(self) -> None:

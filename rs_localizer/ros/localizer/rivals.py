@@ -6,22 +6,13 @@ import math
 import threading
 import time
 from collections import deque
-from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.transforms import Transform, TransformError, read_transform
-from rs_localizer.pipeline.carried_pose import PLACE, TURN, far
-from rs_localizer.pipeline.map_to_odom import Decision
 from rs_localizer.pipeline.published import Broadcast
 
 # Our own come back from TF within this many.
 _REMEMBERED = 1000
-# A transform that is this many deviations away is not ours: neither from before a restart, nor of a
-# recording.
-_DEVIATIONS = 5.0
 # Another parent of a frame that we send has ended if it has not come for so long (s).
 _LASTS = 10.0
 Link = tuple[str, str]  # parent and child
@@ -59,50 +50,26 @@ class Rivals:
             self._first_ns = sent_ns if self._first_ns is None else min(self._first_ns, sent_ns)
             return self._early.pop(link, None)
 
-    def hear(self, message: Any, decision: Decision | None, *, static: bool) -> str:
+    def hear(self, message: Any, *, static: bool) -> str:
         """Return what is wrong with a TransformStamped that has come, one sentence or nothing.
 
         Args:
             message: it.
-            decision: decision on ``map -> odom``, if the node sends it.
             static: whether it is on ``/tf_static``.
         """
         with self._lock:
-            link = _link(message)
-            if link in self._own:
-                text = self._rival(message, link, decision, static)
-            else:
+            link, text = _link(message), ""
+            if link not in self._own:
                 text = self._two_parents(*link, static)
                 if static:
                     self._early[link] = message
+            # What is not ours may yet be of the node before its restart.
+            elif (stamp_ns(message), _numbers(message)) not in self._sent and (
+                static or stamp_ns(message) > (self._first_ns or 0)
+            ):
+                text = f"another node broadcasts {link[0]} -> {link[1]}, too"
         self.static = text if static and text else self.static
         return text
-
-    def _rival(self, message: Any, link: Link, decision: Decision | None, static: bool) -> str:
-        if (stamp_ns(message), _numbers(message)) in self._sent:
-            return ""
-        try:
-            theirs = read_transform(message.transform)
-        except TransformError:
-            return ""
-        other = f"another node broadcasts {link[0]} -> {link[1]}, too"
-        if decision is None or (ours := decision.map_from_odom) is None:
-            return other if static else ""
-        if not static and stamp_ns(message) <= (self._first_ns or 0):
-            return ""  # of the node before its restart
-        held, now = decision.state.held, decision.state.newest
-        assert held and now  # noqa: PT018 - or nothing is sent
-        # Where the last pose was: the less is known since then, the more a rival harms.
-        last, moved = held.newest, replace(held.pose, map_from_odom=theirs)
-        there, spread = held.pose.offset(moved, last.since), last.covariance
-        within = (
-            np.linalg.norm(there[part]) <= _DEVIATIONS * np.sqrt(spread[part, part].trace())
-            for part in (PLACE, TURN)
-        )
-        off = held.pose.offset(moved, now)
-        if not static and all(within):
-            return ""
-        return f"{other}: {_said(theirs)} instead of {_said(ours)}, which moves the body {far(off)}"
 
     def _two_parents(self, parent: str, child: str, static: bool) -> str:
         """Describe a child that goes to and fro, or that is static below two parents."""
@@ -121,12 +88,6 @@ class Rivals:
         if parent != before and not (static and fixed != parent):
             return ""
         return f"TF frame {child!r} has two parents, {last!r} and {parent!r}"
-
-
-def _said(transform: Transform) -> str:
-    x, y, z = transform.translation
-    yaw = np.degrees(np.arctan2(transform.rotation[1, 0], transform.rotation[0, 0]))
-    return f"({x:.2f}, {y:.2f}, {z:.2f}) m, {yaw:.0f} deg"
 
 
 def _link(message: Any) -> Link:
