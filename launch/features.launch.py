@@ -1,9 +1,9 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From a camera to poses in a map of landmarks: camera driver, feature detector, localizer.
+"""From images to poses in a map of landmarks: feature detector and localizer.
 
-ros2 launch rs_localizer features.launch.py camera:=v4l2_camera map_file:=$PWD/map.npz \
-    features:=sift camera_file:=$PWD/camera.yaml
+ros2 launch rs_localizer features.launch.py map_file:=$PWD/map.npz features:=sift \
+    camera_file:=$PWD/camera.yaml
 """
 
 from rs_localizer.config import FeatureConfig

@@ -1,8 +1,8 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From a camera to poses by markers or a board: camera driver, marker detector, localizer.
+"""From images to poses by markers or a board: marker detector and localizer.
 
-ros2 launch rs_localizer markers.launch.py camera:=v4l2_camera marker_map:=$PWD/wall.yaml \
+ros2 launch rs_localizer markers.launch.py marker_map:=$PWD/wall.yaml \
     camera_file:=$PWD/camera.yaml
 """
 

@@ -25,12 +25,8 @@ PACKAGE = "rs_localizer"
 Texts = Mapping[str, str]
 """The launch arguments by name; empty: not given."""
 
-# Drivers by their package, and their executables; both publish image_raw and camera_info.
-DRIVERS = {"v4l2_camera": "v4l2_camera_node", "usb_cam": "usb_cam_node_exe"}
 # Arguments of a launch file that starts from a camera: names, defaults and descriptions.
 CAMERA = {
-    "camera": ("", f"driver to start: {' or '.join(DRIVERS)}; not given: one that runs already"),
-    "calibration": ("", "URL of the camera's calibration, for the driver"),
     "image": ("image_raw", "topic of the raw images (never rectified ones)"),
     "camera_info": ("camera_info", "topic of the calibration"),
 }
@@ -142,26 +138,16 @@ def node(
 
 
 def from_camera(texts: Texts, kind: Kind, values: Mapping[str, Any] | None = None) -> list[Node]:
-    """Return the camera's driver, if wanted, a detector of this kind and the localizer.
+    """Return a detector of this kind and the localizer, of a camera whose driver runs.
 
     Args:
         values: settings of the localizer instead of those that were given.
     """
     image = texts["image"]
-    nodes = [
+    return [
         node(texts, kind, {"image": image, "image/compressed": f"{image}/compressed"}),
         node(texts, NodeConfig, {"camera_info": texts["camera_info"]}, values),
     ]
-    if driver := texts["camera"]:
-        if driver not in DRIVERS:
-            raise ValueError(f"camera must be one of {', '.join(DRIVERS)}; got {driver!r}")
-        url = ParameterValue(texts["calibration"], value_type=str)
-        nodes.insert(0, Node(
-            package=driver, executable=DRIVERS[driver], name="camera",
-            namespace=texts["namespace"], parameters=[{"camera_info_url": url}], output="screen",
-            on_exit=Shutdown(reason="the camera's driver has ended"),
-        ))  # fmt: skip
-    return nodes
 
 
 def with_board(texts: Texts) -> dict[str, Any]:

@@ -197,7 +197,6 @@ def test_the_localizer_knows_how_well_a_board_is_known(describe, tmp_path):
 @pytest.mark.parametrize(
     ("file", "given", "text"),
     [
-        ("markers.launch.py", {"camera": "v4l"}, "one of v4l2_camera, usb_cam; got 'v4l'"),
         ("localizer.launch.py", {"params_file": "/nowhere"}, "^params_file: /nowhere does not"),
         ("rig.launch.py", {"cameras": ""}, "cameras must name the cameras"),
     ],
