@@ -30,11 +30,6 @@ class CameraState:
     angular_velocity: Array  # (3,) rad/s, in camera axes
     linear_velocity: Array  # (3,) m/s, of the camera centre, in camera axes
 
-    @property
-    def linear_velocity_in_map(self) -> Array:
-        """Velocity (3,) of the camera centre, m/s, along the axes of the map."""
-        return np.asarray(self.rotation @ self.linear_velocity)
-
 
 def camera_state(motion: Motion, camera: Camera | Rig, tau: float = 0.0) -> CameraState:
     """Return an estimate in SI units, at one of its rows.

@@ -92,9 +92,6 @@ def cut(state: Unknowns, start: float, end: float) -> Unknowns | None:
 
 
 _LEAST_IMAGES = 20
-# Keypoints of all images together: each image keeps its part. A fisheye of 285 images with 352
-# corners each took minutes longer, for a lens and a readout time that errors of the corners limit.
-_MOST_SIGHTS = 40_000
 # A board: few landmarks, seen often. Each is where it should be to about this part of its size (a
 # quarter of a millimetre of an A4 sheet), beside what bends all of it.
 _MOST_BOARD_POINTS, _LEAST_SIGHTS, _BOARD_SHARE = 400, 30, 1e-3
@@ -293,7 +290,7 @@ def calibrate(
         ValueError: when the recording determines nothing, saying what was found.
     """
     taken = np.unique([image.stamp_ns for image in images])
-    images = _thinned(in_order(images))
+    images = in_order(images)
     if len(images) < _LEAST_IMAGES:
         raise ValueError(f"{len(images)} images show the map, at least {_LEAST_IMAGES} are needed")
     stamps = examine((taken - taken[0]) * 1e-9)
@@ -344,19 +341,6 @@ def is_turned(camera: Camera, images: list[ImagePoints]) -> bool:
         if tracker.shutter.rows_turn:
             return True
     return False
-
-
-def _thinned(images: list[ImagePoints]) -> list[ImagePoints]:
-    """Thin images to as many keypoints as are worth their time, others in each image."""
-    every = sum(len(image.points) for image in images) / _MOST_SIGHTS
-    if every <= 1.0:
-        return images
-    kept = (np.floor(np.arange(k / len(images), len(image.points), every)).astype(np.int64)
-            for k, image in enumerate(images))  # fmt: skip
-    return [
-        replace(image, points=image.points[rows], pixels=image.pixels[rows])
-        for image, rows in zip(images, kept, strict=True)
-    ]
 
 
 def _freedom(observations: SplineKeypoints, intrinsics: bool) -> Freedom:

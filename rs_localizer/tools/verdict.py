@@ -13,8 +13,6 @@ from rs_localizer.core.scanning import REVERSED, ScanDirection
 from rs_localizer.tools.camera_calibration import CameraCalibration
 from rs_localizer.tools.rig_mounts import Mounted
 
-# Beyond this (s rms) the images' own times are mentioned.
-_WORTH_A_WORD = 5e-4
 # Ninths of the image by row; one in which no keypoint lies is a guess of the lens.
 _REGIONS = (
     "top left", "top", "top right", "left", "middle", "right", "bottom left", "bottom",
@@ -68,11 +66,6 @@ def remarks(result: CameraCalibration) -> Iterator[str]:
         )
     if result.stamps.irregular:
         yield f"stamps are irregular: {1e3 * result.stamps.jitter:.2f} ms rms about even intervals"
-    if result.jitter > _WORTH_A_WORD:
-        yield (
-            f"exposures are {1e3 * result.jitter:.1f} ms rms off their stamps; their times were "
-            "estimated, and the value depends on the mean interval"
-        )
     if result.stamps.missing:
         yield f"{result.stamps.missing} images are missing between the others"
     if result.inflation > 1.0:

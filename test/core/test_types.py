@@ -181,7 +181,9 @@ def test_the_state_in_si_units_and_in_the_map_is_that_of_the_poses(tau):
     np.testing.assert_allclose(state.rotation, turns[1].as_matrix(), atol=1e-12)
     np.testing.assert_allclose(Rotation.from_quat(state.orientation).as_matrix(), state.rotation)
     velocity = (places[2] - places[0]) / seconds
-    np.testing.assert_allclose(state.linear_velocity_in_map, velocity, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(
+        state.rotation @ state.linear_velocity, velocity, rtol=1e-5, atol=1e-6
+    )
     np.testing.assert_allclose(state.linear_velocity, state.rotation.T @ velocity, rtol=1e-5)
     rate = (turns[2] * turns[0].inv()).as_rotvec() / seconds
     np.testing.assert_allclose(state.rotation @ state.angular_velocity, rate, rtol=1e-5, atol=1e-5)

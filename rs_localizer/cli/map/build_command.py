@@ -78,15 +78,15 @@ class Options(ImageOptions, ResultOptions):
         "a point in the first image at or after SECONDS from the start, by its raw pixel; each "
         "one in two images or more", "NAME SECONDS U V", list,
     )  # fmt: skip
-    distance: list[tuple[str, str, str]] = option(
-        "between two of these points", "NAME NAME METRES", list
+    distance: tuple[str, str, str] | None = option(
+        "between two of these points", "NAME NAME METRES"
     )
 
 
 def run(args: Options) -> None:
     of_point = partial(_number, "--point")
     points = [(name, of_point(s), of_point(u), of_point(v)) for name, s, u, v in args.point]
-    distances = _distances(args, [name for name, *_ in points])
+    distance = _distance(args, [name for name, *_ in points])
     require()
     check_there([args.recording])
     markers = None if args.markers is None else read_marker_map(args.markers)
@@ -99,7 +99,7 @@ def run(args: Options) -> None:
             sights = [
                 PointSight(name, looked.moments[seconds], (u, v)) for name, seconds, u, v in points
             ]
-            anchors = Anchors(markers, tuple(sights), tuple(distances))
+            anchors = Anchors(markers, tuple(sights), distance)
             inputs = Given(looked.views, looked.camera, anchors, *shutter, frame)
             folder = out / COLMAP
             folder.mkdir()
@@ -108,25 +108,25 @@ def run(args: Options) -> None:
     _print_result(args, built, looked)
 
 
-def _distances(options: Options, names: list[str]) -> list[Distance]:
-    """Return the given distances, after checking that each point is given in two images."""
+def _distance(options: Options, names: list[str]) -> Distance | None:
+    """Return the given distance, after checking that each point is given in two images."""
     if options.markers is not None and (options.point or options.distance):
         raise UsageError("give either --markers or --point and --distance")
-    if options.point and not options.distance:
-        raise UsageError("--point needs --distance")
-    distances = []
-    for one, other, text in options.distance:
-        metres = _number("--distance", text)
-        if not metres > 0.0 or one == other:
-            raise UsageError(f"--distance: must be two points and metres, got {one} {other} {text}")
-        for name in (one, other):
-            if names.count(name) < 2:
-                raise UsageError(
-                    f"--distance: the point {name} must be given by --point in two images or more, "
-                    f"it is in {names.count(name)}"
-                )
-        distances.append(Distance(one, other, metres))
-    return distances
+    if options.distance is None:
+        if options.point:
+            raise UsageError("--point needs --distance")
+        return None
+    one, other, text = options.distance
+    metres = _number("--distance", text)
+    if not metres > 0.0 or one == other:
+        raise UsageError(f"--distance: must be two points and metres, got {one} {other} {text}")
+    for name in (one, other):
+        if (count := names.count(name)) < 2:
+            raise UsageError(
+                f"--distance: the point {name} must be given by --point in two images or more, it "
+                f"is in {count}"
+            )
+    return Distance(one, other, metres)
 
 
 def _number(option: str, text: str) -> float:

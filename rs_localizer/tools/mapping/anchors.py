@@ -23,8 +23,6 @@ from rs_localizer.tools.mapping.triangulation import Sights, Triangulated, trian
 _MOST_MISFIT = 0.02
 # Corners that are further off than both, m and part of their extent, are off for a reason.
 _USUAL_MISFIT = 0.005, 0.002
-# Distances contradict each other when the scales that they ask for differ by more than this part.
-_MOST_CONTRADICTION = 0.03
 _LEAST_CORNERS = 4
 # Standard deviation (m) of corners in their map: prints are measured to within this.
 _DEVIATION = 0.001
@@ -54,7 +52,7 @@ class Anchors:
 
     marker_map: MarkerMap | None = None
     sights: tuple[PointSight, ...] = ()
-    distances: tuple[Distance, ...] = ()
+    distance: Distance | None = None
 
     @property
     def names(self) -> list[str]:
@@ -99,12 +97,12 @@ def placement(
     """Return the frame of the map in metres.
 
     Args:
-        anchors: known points, distances and markers.
+        anchors: known points, a distance, or markers.
         triangulated: where they are in the map.
         rotations, positions: (g,3,3), (g,3) map_from_camera of all views, as they were held.
 
     Raises:
-        ValueError: if the anchors contradict each other or were not seen.
+        ValueError: if the anchors contradict the map or were not seen.
     """
     if anchors.marker_map is not None:
         return _by_markers(anchors.marker_map, triangulated)
@@ -113,35 +111,20 @@ def placement(
     across = rotations[:, :, 0]
     axis, down = np.linalg.eigh(across.T @ across)[1][:, 0], rotations[:, :, 1].mean(axis=0)
     turn = upright(axis if axis @ down >= 0.0 else -axis)
-    if not anchors.distances:
+    if (known := anchors.distance) is None:
         return Placement(
             Similarity(1.0, turn, -turn @ positions[0]), False, "the scale is undetermined"
         )
-    names, factors = anchors.names, []
-    for distance in anchors.distances:
-        ends = distance.one, distance.other
-        if unknown := [name for name in ends if name not in names]:
-            raise ValueError(f"unknown point {unknown[0]}; points are {', '.join(names) or 'none'}")
-        rows = [anchors.corners + names.index(name) for name in ends]
-        one, other = triangulated.points[rows]
-        apart = float(np.linalg.norm(one - other))
-        if not apart > 0.0:  # NaN: one of them is seen by one image only, or far away
-            raise ValueError(
-                f"the distance {distance.one} {distance.other} gives no scale: each point must be "
-                "given in two images or more that see it from different places"
-            )
-        factors.append(distance.metres / apart)
-    scale = float(np.median(factors))
-    spread = max(factors) / min(factors) - 1.0
-    if spread > _MOST_CONTRADICTION:
+    rows = [anchors.corners + anchors.names.index(name) for name in (known.one, known.other)]
+    apart = float(np.linalg.norm(np.subtract(*triangulated.points[rows])))
+    if not apart > 0.0:  # NaN: one of them is seen by one image only, or far away
         raise ValueError(
-            f"the distances contradict each other by {100 * spread:.1f} %: check the points' "
-            "pixels and the metres"
+            f"the distance {known.one} {known.other} gives no scale: each point must be given in "
+            "two images or more that see it from different places"
         )
-    return Placement(
-        Similarity(scale, turn, -scale * turn @ positions[0]), True,
-        f"{len(factors)} measured distances (which agree within {100 * spread:.1f} %)",
-    )  # fmt: skip
+    scale = known.metres / apart
+    similarity = Similarity(scale, turn, -scale * turn @ positions[0])
+    return Placement(similarity, True, f"the distance {known.one} {known.other}")
 
 
 def determined_corners(marker_map: MarkerMap, triangulated: Triangulated) -> BoolArray:

@@ -184,7 +184,6 @@ class Built:
     landmarks: Map
     camera: Camera  # with its lens, readout time and scan direction, as they were found
     placement: Placement
-    keyframes: IntArray  # rows of the views that COLMAP got
     structure: Structure  # as COLMAP had it, moved into this frame as a whole
     kept: IntArray  # (l,) rows of the structure's points that are landmarks
     shutter: ShutterFit | None  # None: it was given, and the images do not contradict it
@@ -226,8 +225,7 @@ def build_map(inputs: Given, folder: Path, stage: Stage) -> Built:
     )
     with stage("track", len(inputs.views)) as step:
         tracked = track_on_map(inputs.views, structure, camera, lambda: step(1))
-    built = built_from(inputs, structure, tracked, camera, stage)
-    return replace(built, keyframes=keyframes)
+    return built_from(inputs, structure, tracked, camera, stage)
 
 
 def built_from(
@@ -280,7 +278,6 @@ def built_from(
     )  # fmt: skip
     return Built(
         landmarks=landmarks, camera=refined.camera_as_found, placement=place,
-        keyframes=structure.views,
         structure=replace(structure, start=structure.start.moved(similarity)), kept=kept,
         shutter=shutter, readout_check=check, refined=refined, posed=motion.rows,
         rotations=similarity.rotation @ rotations, positions=similarity(positions),
