@@ -37,11 +37,11 @@ from rs_localizer.io.camera_files import lens_parameters, write_calibration
 from rs_localizer.io.imu import ImuRecording
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.rigs import RigParts
-from rs_localizer.io.topics import CAMERA_INFO, IMAGE, IMU
+from rs_localizer.io.topics import IMAGE, IMU
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.offline.fleet import Figures
-from rs_localizer.offline.recordings import optical_frame, read_imu_recording
+from rs_localizer.offline.recordings import read_imu_recording
 from rs_localizer.offline.replay import has_frames
 from rs_localizer.pipeline.marker_detector import FrameDetector
 from rs_localizer.settings import build, write_parameters
@@ -199,8 +199,7 @@ def _read(args: Options, config: NodeConfig) -> _Input:
         raise UsageError("--imu is for bags, which have an IMU beside the images")
     with open_bag(path) if of_bag else nullcontext() as bag:
         if bag is not None and args.imu:
-            frame = optical_frame(bag, topics.get(CAMERA_INFO))
-            imu = read_imu_recording(bag, topics.get(IMU), frame)
+            imu = read_imu_recording(bag, topics.get(IMU))
         if bag is not None and IMAGE not in topics and has_frames(bag):
             if args.rate is not None:
                 raise UsageError("--rate is for images; a bag has its own times")

@@ -40,7 +40,7 @@ from rs_localizer.offline.image_sources import (
     image_files,
     name_times,
 )
-from rs_localizer.offline.recordings import optical_frame, read_recording
+from rs_localizer.offline.recordings import read_recording
 from rs_localizer.offline.replay import camera_topics, find_topics
 from rs_localizer.pipeline.inputs import CAMERA_INFO_TYPE, IMAGE_TYPES, INPUTS
 from rs_localizer.settings import build, camera_values, load_params_file, parse_assignment
@@ -274,7 +274,7 @@ def _in_one_bag(path: Path, given: Sequence[str] | None) -> list[tuple[str, dict
             (
                 name,
                 {"recording": path, "remaps": [f"{it}:={topic}" for it, topic in own.items()]},
-                optical_frame(bag, own["camera_info"]),
+                next((m.header.frame_id for *_, m in bag.messages([own[CAMERA_INFO]])), ""),
             )
             for name, own in camera_topics(bag, given).items()
         ]

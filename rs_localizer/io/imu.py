@@ -20,7 +20,6 @@ class ImuRecording:
 
     stamps_ns: IntArray  # (k,)
     angular_velocities: Array  # (k,3) rad/s, in its own axes
-    camera_from_imu: Array | None = None  # (3,3) as others say: checked, not believed
 
 
 # Gyroscopes end at 70 rad/s (4000 deg/s), accelerometers of robots at some hundred g: beyond these

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """All correspondences, or the whole IMU, of a recording at once: for estimators of many images."""
 
-import contextlib
 from collections import Counter
 from dataclasses import dataclass
 
@@ -10,17 +9,16 @@ import numpy as np
 
 from rs_localizer import matching
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.io.bags import BagError, BagReader
+from rs_localizer.io.bags import BagReader
 from rs_localizer.io.camera_info import Calibration, read_camera_info
 from rs_localizer.io.clouds import Correspondences, read_correspondences, read_keypoints, read_map
 from rs_localizer.io.imu import ImuRecording, read_imu
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError
-from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, KEYPOINTS, MAP_POINTS, TF_STATIC
-from rs_localizer.io.transforms import TransformError, TransformTree
+from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, KEYPOINTS, MAP_POINTS
 from rs_localizer.matching import Matcher, MatchError
-from rs_localizer.offline.replay import TF_TYPE, Topics, as_tf2, imu_topics, tf_topics
-from rs_localizer.pipeline.inputs import CAMERA_INFO_TYPE, IMAGE_TYPES, IMU_TYPE
+from rs_localizer.offline.replay import Topics, imu_topics
+from rs_localizer.pipeline.inputs import IMU_TYPE
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,12 +71,11 @@ def read_recording(bag: BagReader, topics: Topics, landmarks: Map | None = None)
     return Recorded(calibration, tuple(clouds))
 
 
-def read_imu_recording(bag: BagReader, topic: str | None, camera_frame: str) -> ImuRecording:
-    """Read the readings of an IMU, and its mount on the camera if TF has it.
+def read_imu_recording(bag: BagReader, topic: str | None) -> ImuRecording:
+    """Read the readings of an IMU.
 
     Args:
         topic: None: the only one of its type.
-        camera_frame: optical frame of the camera.
 
     Raises:
         BagError: when the topic is not there, or several could be meant.
@@ -87,38 +84,15 @@ def read_imu_recording(bag: BagReader, topic: str | None, camera_frame: str) -> 
     if topic is None and len(found := imu_topics(bag)) == 1:
         topic = found[0]
     topic = bag.find_topic((IMU_TYPE,), topic, "-r imu:=TOPIC")
-    stamps, rates, frame, fault = [], [], "", ""
+    stamps, rates, fault = [], [], ""
     for _, _, message in bag.messages([topic]):
         try:
             reading = read_imu(message)
         except MessageError as error:
             fault = f": {error}"
             continue
-        frame = reading.frame
         stamps.append(reading.stamp_ns)
         rates.append(reading.angular_velocity)
     if not stamps:
         raise ValueError(f"{bag.path} has no usable message on {topic}{fault}")
-    tree, turn = TransformTree(), None
-    for tf in tf_topics(bag, TF_TYPE):
-        for _, _, message in bag.messages((tf,)):
-            tree.add(as_tf2(message), static=tf == TF_STATIC)
-    with contextlib.suppress(TransformError):
-        turn = tree.lookup(camera_frame, frame, None).rotation
-    return ImuRecording(np.array(stamps, np.int64), np.array(rates), turn)
-
-
-def optical_frame(bag: BagReader, info: str | None = None) -> str:
-    """Return the camera's frame, by its first camera_info or image; empty if unknown.
-
-    Args:
-        info: topic; None: the only one of its type.
-    """
-    for types, topic in (((CAMERA_INFO_TYPE,), info), (IMAGE_TYPES, None)):
-        try:
-            source = bag.find_topic(types, topic, "")
-        except BagError:
-            continue
-        for _, _, message in bag.messages([source]):
-            return str(message.header.frame_id)
-    return ""
+    return ImuRecording(np.array(stamps, np.int64), np.array(rates))

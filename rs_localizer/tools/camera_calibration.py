@@ -313,7 +313,7 @@ def calibrate(
     if imu is not None:
         try:
             samples = gyro_samples(imu, posed.start_ns)
-            observations, fitted = with_gyro(observations, fitted, samples, imu.camera_from_imu)
+            observations, fitted = with_gyro(observations, fitted, samples)
         except Undetermined as error:
             no_mount = str(error)
     return _judged(

@@ -43,15 +43,10 @@ _LEAST_GUESS = 100
 _LEAST_EXPLAINED = 0.5
 # A unit is wrong, not a scale, where rates differ by more than this.
 _MOST_SCALE = 1.5
-# Weight of a rotation that is given, by what the motion says: it helps where that is nothing.
-_GIVEN_WEIGHT = 1e-3
 
 
-def first_mount(samples: GyroSamples, spline: Spline, given: Array | None = None) -> GyroMount:
+def first_mount(samples: GyroSamples, spline: Spline) -> GyroMount:
     """Return delay, rotation and bias under which the gyroscope best follows the camera.
-
-    Args:
-        given: (3,3) camera_from_imu, as far as the motion does not tell it.
 
     Raises:
         Undetermined: when there are too few samples during the motion, or they show other turns.
@@ -66,7 +61,7 @@ def first_mount(samples: GyroSamples, spline: Spline, given: Array | None = None
         )
     near = near.subset(np.arange(len(near.times)) % (1 + len(near.times) // _GUESS_SAMPLES) == 0)
     delays = np.arange(-_MOST_DELAY, _MOST_DELAY + 0.5 * _DELAY_STEP, _DELAY_STEP)
-    matches = [_match(near, spline, float(delay), given) for delay in delays]
+    matches = [_match(near, spline, float(delay)) for delay in delays]
     mount, explained, scale = max(matches, key=lambda match: match[1])
     if not explained > _LEAST_EXPLAINED:
         raise Undetermined(
@@ -80,9 +75,7 @@ def first_mount(samples: GyroSamples, spline: Spline, given: Array | None = None
     return mount
 
 
-def _match(
-    samples: GyroSamples, spline: Spline, delay: float, given: Array | None
-) -> tuple[GyroMount, float, float]:
+def _match(samples: GyroSamples, spline: Spline, delay: float) -> tuple[GyroMount, float, float]:
     """Return the best rotation (Kabsch) and bias at a delay.
 
     And the share of the gyroscope's variance that they explain, and the scale of its rates.
@@ -96,8 +89,6 @@ def _match(
     product = (turns - turn).T @ (rates - rate)
     turning, shown = float(np.sum((turns - turn) ** 2)), float(np.sum((rates - rate) ** 2))
     power = float(np.sqrt(turning * shown))
-    if given is not None:
-        product = product + _GIVEN_WEIGHT * power * given
     left, strengths, right = np.linalg.svd(product)
     sign = np.array([1.0, 1.0, np.linalg.det(left @ right)])
     rotation = left * sign @ right
@@ -140,14 +131,13 @@ class MountFound:
 
 
 def with_gyro(
-    observations: SplineKeypoints, fitted: Fit, samples: GyroSamples, given: Array | None
+    observations: SplineKeypoints, fitted: Fit, samples: GyroSamples
 ) -> tuple[SplineKeypoints, Fit]:
     """Fit the motion again, with a gyroscope and its mount in it.
 
     Args:
         observations: keypoints.
         fitted: motion of the keypoints alone.
-        given: (3,3) camera_from_imu as others say; checked, not believed.
 
     Returns:
         The observations with the samples and their noise, and the estimate.
@@ -156,7 +146,7 @@ def with_gyro(
         Undetermined: when the gyroscope shows other turns than the camera, or the joint system
             cannot be solved.
     """
-    mount = first_mount(samples, fitted.state.spline, given)
+    mount = first_mount(samples, fitted.state.spline)
     guess = replace(fitted, state=replace(fitted.state, mount=mount))
     samples, joint = _settled(observations, samples, guess)
     least = _LEAST_SAMPLES * float(np.median(np.diff(samples.times)))

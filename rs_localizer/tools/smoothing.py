@@ -18,7 +18,6 @@ from rs_localizer.config import PoseTime
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.rig import Rig, RigEstimate
-from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
 from rs_localizer.core.types import Estimate, roughness
 from rs_localizer.io.outputs import Localized
@@ -83,11 +82,6 @@ _FADING = 0.1
 _SHAKEN, _SHAKEN_SIGMAS, _MOST_SHAKEN = 1.5, 5.0, 0.2
 # rad per readout that is known beside a parabola: vibration.
 _ROUGH = 2e-3
-# So are frames whose own in-frame turns move their points by more than their residual, as most of
-# those next to them do: of a hand, 65 points at 1 px, at most one in twenty does by chance, of 0.3
-# deg at 60 Hz all do, by 1.3 to 5.4 times.
-_IN_FRAME, _NEXT = 1.0, 9
-_ROWS = np.linspace(-0.5, 0.5, 17)
 Parts = list[SplineKeypoints]
 """Keypoints of each camera."""
 # The expected accelerations are settled when they change by less than this part.
@@ -211,7 +205,7 @@ def smooth(rig: Rig, frames: list[PosedFrame]) -> Smoothed:
     parts = [seen.subset(spline.layout.inside(seen.times)) for seen in parts]
     start = rig_state(spline, zip(parts, mounted, strict=True))
     best = _best(parts, start, fading)
-    shaken = _shaken(best, parts, rig.focal_length, estimates)
+    shaken = _shaken(best, parts, estimates)
     if shaken.mean() > _MOST_SHAKEN:
         shaken[:] = True
     return Smoothed(best, readout_time, start_ns, times, shaken)
@@ -253,7 +247,7 @@ def _solved(parts: Parts, start: Unknowns, freedom: Freedom, deviation: float | 
     return solve(Problem(views, start), start, deviation)
 
 
-def _shaken(fitted: Fit, parts: Parts, focal_length: float, estimates: list[Estimate]) -> BoolArray:
+def _shaken(fitted: Fit, parts: Parts, estimates: list[Estimate]) -> BoolArray:
     """Return a mask (f,) of images with vibration that the motion does not follow."""
     frames = np.concatenate([seen.frames for seen in parts])
     own = np.array([max(one.residual_rms, fitted.freedom.least_noise) ** 2 for one in estimates])
@@ -267,19 +261,7 @@ def _shaken(fitted: Fit, parts: Parts, focal_length: float, estimates: list[Esti
     shaken = (count > 0) & (off > limit * own / freedom)
     # Or more than their points tells of it.
     rough = [one.aided and roughness(one) > _ROUGH for one in estimates]
-    return np.asarray(shaken | rough | _turns_in_frame(focal_length, estimates), np.bool_)
-
-
-def _turns_in_frame(focal_length: float, estimates: list[Estimate]) -> BoolArray:
-    """Return a mask (f,) of images whose in-frame rotation knots follow only in part."""
-    turns = [
-        shake_at(_ROWS, one.shake)[:, :3] if len(one.shake) else np.zeros(3) for one in estimates
-    ]
-    moved = focal_length * np.array([np.sqrt(np.mean(3.0 * turn**2)) for turn in turns])
-    turning = moved > _IN_FRAME * np.array([one.residual_rms for one in estimates])
-    around = np.ones(min(_NEXT, len(turning)))
-    near, count = (np.convolve(of, around, "same") for of in (turning, np.ones(len(turning))))
-    return np.asarray(turning & (near > 0.5 * count))
+    return np.asarray(shaken | rough, np.bool_)
 
 
 def _lively(parts: Parts, fitted: Fit) -> Fit:

@@ -36,7 +36,7 @@ def recorded(path: Path, absent: bool, *more: str) -> Path:
 def test_an_accelerometer_beside_it_is_no_choice(absent, tmp_path):
     with open_bag(recorded(tmp_path / "bag", absent)) as bag:
         assert imu_topics(bag) == [GYRO]
-        readings = read_imu_recording(bag, None, "eye")  # of calibrate --imu
+        readings = read_imu_recording(bag, None)  # of calibrate --imu
         np.testing.assert_array_equal(readings.angular_velocities[-1], RATE)
 
 

@@ -111,12 +111,10 @@ def build_structure(
     said = _run(folder / _TASK, stage)
     (folder / _TASK).unlink()
     if not said["parts"]:
-        count = len(keyframes)
         raise ValueError(
-            f"no two of the {count} keyframes determine a structure "
-            f"({said['features'] / count:.0f} features each, {said['pairs']} pairs of them agree): "
-            "the images need texture that does not repeat, overlap, and a camera that moves "
-            "sideways, not one that only rotates"
+            f"no two of the {len(keyframes)} keyframes determine a structure: the images need "
+            "texture that does not repeat, overlap, and a camera that moves sideways, not one that "
+            "only rotates"
         )
     model = read_model(folder / SPARSE, folder / DATABASE)
     assert model.descriptors is not None

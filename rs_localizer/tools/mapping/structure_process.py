@@ -22,8 +22,6 @@ DATABASE, SPARSE = "database.db", "sparse"
 _ONLY_FATAL = 3
 # Images and pairs of images between two steps of the progress bar.
 _IMAGES_AT_ONCE, _PAIRS_AT_ONCE = 8, 25
-# COLMAP's own least number of matches of two images (its ``min_num_matches``).
-LEAST_MATCHES = 15
 
 
 def main(task: dict[str, Any]) -> None:
@@ -41,7 +39,7 @@ def main(task: dict[str, Any]) -> None:
     _extract(task, database)
     _match(task, database)
     ordered = _map(task, database, folder)
-    result = {"parts": [model.num_reg_images() for model in ordered]} | _statistics(database)
+    result = {"parts": [model.num_reg_images() for model in ordered]}
     if ordered:
         (folder / SPARSE).mkdir()
         ordered[0].write(folder / SPARSE)
@@ -111,16 +109,6 @@ def _map(task: dict[str, Any], database: Path, folder: Path) -> list[Any]:
             database, task["images"], parts, options, next_image_callback=lambda: _say("step", 1)
         )
     return sorted(models.values(), key=lambda model: -model.num_reg_images())
-
-
-def _statistics(database: Path) -> dict[str, Any]:
-    """Count what the model was made of: features, and pairs of images that agree."""
-    with pycolmap.Database.open(database) as tables:
-        _, matches = tables.read_two_view_geometry_num_inliers()
-        return {
-            "features": tables.num_keypoints(),
-            "pairs": sum(count >= LEAST_MATCHES for count in matches),
-        }
 
 
 if __name__ == "__main__":
