@@ -19,7 +19,7 @@ from benchmarks.aided import believed
 from benchmarks.frames.judged import FIVE_SIGMA, REGION
 from benchmarks.independent import cameras
 from benchmarks.independent.rotations import Array, exponential, logarithm
-from rs_localizer.cli.options import integer
+from rs_localizer.cli.options import number
 from rs_localizer.config import NodeConfig
 from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.features.extraction import Features
@@ -384,7 +384,7 @@ _PARTS: dict[str, Callable[[int], Iterator[str]]] = {
 def main() -> int:
     parser = command(".mapping", __doc__)
     parser.add_argument("names", nargs="+", metavar="PART", choices=_PARTS, help=", ".join(_PARTS))
-    parser.add_argument("--seed", type=integer(0), default=0, metavar="N")
+    parser.add_argument("--seed", type=number(0, kind=int), default=0, metavar="N")
     options = parser.parse_args()
     for name in options.names:
         for text in _PARTS[name](options.seed):

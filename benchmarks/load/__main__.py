@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.load.camera import simulated
 from benchmarks.load.measuring import Result, steady
-from rs_localizer.cli.options import integer, number
+from rs_localizer.cli.options import number
 
 _MOST_REPLACED = 0.001  # share of the frames
 _MOST_P50, _MOST_P99 = 4.0, 12.0  # ms
@@ -25,9 +25,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.load", description=__doc__)
     parser.add_argument("--rate", type=number(1.0), default=100.0, help="Hz of each camera")
     parser.add_argument("--minutes", type=number(0.05), default=1.0)
-    parser.add_argument("--points", type=integer(12), default=500, help="of each frame")
+    parser.add_argument("--points", type=number(12, kind=int), default=500, help="of each frame")
     parser.add_argument("--outliers", type=number(0.0, 0.9), default=0.3, help="share of them")
-    parser.add_argument("--cameras", type=integer(1), default=1, help="each with its own node")
+    parser.add_argument(
+        "--cameras", type=number(1, kind=int), default=1, help="each with its own node"
+    )
     parser.add_argument(
         "--imu", type=number(100.0), default=0.0, metavar="HZ", help="of an IMU beside each camera"
     )

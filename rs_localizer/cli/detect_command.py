@@ -76,7 +76,9 @@ def run(args: Options) -> Figures:
 def detect(args: Options) -> Figures:
     """Detect in the images of one recording, of each camera of a rig, and say what came of it."""
     of_map, detect_images = _of_markers(args) if args.features is None else _of_features(args)
-    settings, every, warnings = build(shutter_values(args)), list[Figures](), list[str]()
+    settings, warnings = build(shutter_values(args)), list[str]()
+    every = list[tuple[int, int, float]]()
+    kind = "keypoints" if args.features else "corners"
     with atomic_directory(args.out, earlier_result(args, "metadata.yaml")) as out:
         with BagWriter(out) as bag:
             cameras = {"": args}
@@ -95,12 +97,10 @@ def detect(args: Options) -> Figures:
                     options = offline.DetectionOptions(args.with_images, of.scan_direction, name)
                     found = detect_images(shots, bag, options, bar)
                 count, median = len(found.counts), float(np.median(found.counts))
-                kind = "keypoints" if args.features else "corners"
-                figures: Figures = {"images": found.images, f"with_{kind}": count, kind: median}
-                every.append(figures)
-                kind += f" ({args.features})" if args.features else ""
-                said = f"{count} of {found.images} images, {median:.0f} {kind} each (median)"
-                print(f"{f'{args.out}, {name}' if name else args.out}: {said}")
+                every.append((found.images, count, median))
+                said = f"{count} of {found.images} images, {median:.0f} {kind}"
+                said += f" ({args.features})" if args.features else ""
+                print(f"{f'{args.out}, {name}' if name else args.out}: {said} each (median)")
                 print("".join(f"note {note}\n" for note in found.notes), end="")
                 if kept := [f"{topic} ({count})" for topic, count in found.carried.items()]:
                     print(f"kept for replay: {', '.join(kept)}")
@@ -110,14 +110,9 @@ def detect(args: Options) -> Figures:
                 warnings += found.faults
         if values := {**of_map, **shutter_values(args)}:
             write_parameters(out / PARAMETERS, values)
-    merged = {key: _WORST[key](each[key] for each in every) for key in every[0]}
-    return {**merged, "warnings": "; ".join(warnings)}
-
-
-# Worst values of several cameras.
-_WORST: dict[str, Any] = {
-    "images": sum, "with_corners": sum, "corners": min, "with_keypoints": sum, "keypoints": min,
-}  # fmt: skip
+    images, counts, medians = zip(*every, strict=True)
+    figures: Figures = {"images": sum(images), f"with_{kind}": sum(counts), kind: min(medians)}
+    return figures | {"warnings": "; ".join(warnings)}
 
 
 Detection = Callable[["Shots", BagWriter, "offline.DetectionOptions", Any], "Extraction"]

@@ -27,7 +27,6 @@ class Options:
         f"a topic of recordings, NAME one of {', '.join(_TOPICS)}; may be repeated (default: the "
         "only one of its type)", "NAME:=TOPIC", list, flag="-r",
     )  # fmt: skip
-    offset: float = option("add this to the times of EST, s", "S", 0.0)
     ate: bool = option(
         "also ATE and RPE after alignment, by evo (pip install 'rs_localizer[evaluate]')",
         default=False,
@@ -39,9 +38,6 @@ def run(options: Options) -> Figures:
     topics = remapped(options, _TOPICS)
     estimate = read_motions(options.estimate, topics.get("pose"), topics.get("twist"))
     truth = read_motions(options.truth, topics.get("truth_pose"), topics.get("truth_twist"))
-    for part in (estimate.poses, estimate.twists):
-        if part is not None:
-            part.stamps_ns[:] += round(options.offset * 1e9)
     rows, true_rows = errors.associate(estimate.poses.stamps_ns, truth.poses.stamps_ns)
     if len(rows) == 0:
         raise ValueError(

@@ -9,7 +9,6 @@ each class is the title of its group in the help.
 from __future__ import annotations
 
 import argparse
-import functools
 import math
 import re
 import types
@@ -33,10 +32,7 @@ class UsageError(ValueError):
 def argument(help: str, metavar: str, default: Any = MISSING) -> Any:  # noqa: A002
     """Declare a field that is given by its place; a list takes one or more.
 
-    Args:
-        help: description.
-        metavar: its name in the help.
-        default: makes it optional; ``list``: none or more.
+    A ``default`` makes it optional; ``list``: none or more.
     """
     return _field(default, {"help": help, "metavar": metavar, "positional": True})
 
@@ -57,16 +53,14 @@ def option(
 
     Args:
         help: description; a default that is not None, False or an empty list is added.
-        metavar: of its value.
         default: ``list`` for one that may be repeated; of a switch, False.
         flag: another name, such as ``-p``, or several.
-        choices: of a text.
         least, most, above: limits of a number, which is more than the last.
-        required: there is no default.
     """
     return _field(default, {
         "help": help, "metavar": metavar, "flag": flag, "choices": tuple(choices),
-        "limits": (least, most, above), "required": required, "positional": False,
+        "limits": {"least": least, "most": most, "above": above}, "required": required,
+        "positional": False,
     })  # fmt: skip
 
 
@@ -117,9 +111,8 @@ class Parser(argparse.ArgumentParser):
     """Reports faults by a :class:`UsageError`, with the option that may be meant."""
 
     def __init__(self, **words: Any) -> None:
-        words |= {"allow_abbrev": False}
-        words.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
-        super().__init__(**words)
+        form = argparse.RawDescriptionHelpFormatter
+        super().__init__(allow_abbrev=False, formatter_class=form, **words)
 
     def error(self, message: str) -> NoReturn:
         if unknown := re.match(r"unrecognized arguments: (-[^\s=]+)", message):
@@ -153,8 +146,8 @@ def _add(group: argparse._ActionsContainer, kind: type[Any], item: Any) -> None:
     if one is bool:
         words["action"] = "store_true"
     else:
-        limits, words["metavar"] = about.get("limits", ()), about["metavar"] or None
-        types = {float: number(*limits), int: integer(*limits)}
+        limits, words["metavar"] = about.get("limits", {}), about["metavar"] or None
+        types = {float: number(**limits), int: number(**limits, kind=int)}
         words["type"] = types.get(one, one)
         if about.get("choices"):
             words["choices"] = about["choices"]
@@ -226,7 +219,3 @@ def number(
         return value
 
     return parse
-
-
-integer = functools.partial(number, kind=int)
-"""A whole number, likewise."""

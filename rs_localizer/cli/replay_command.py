@@ -23,8 +23,7 @@ from rs_localizer.io.bags import is_bag, open_bag
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.recording import BRIDGED, CAMERA, MAP, MAP_FRAME, PARAMETERS, RESULT
 from rs_localizer.io.topics import IMU
-from rs_localizer.io.trajectories import POSES_FILE as POSES
-from rs_localizer.io.trajectories import TWISTS_FILE as TWISTS
+from rs_localizer.io.trajectories import POSES_FILE, TWISTS_FILE
 from rs_localizer.markers.map_files import is_marker_file
 from rs_localizer.offline import fleet, frame_table
 from rs_localizer.offline.fleet import Figures, Outcome, Task
@@ -44,8 +43,8 @@ class Options(ImageOptions, ResultOptions):
         "RECORDING",
     )
     out: Path | None = option(
-        f"directory to create, for {POSES} (TUM), {TWISTS} and the bag {RESULT}; of many, one for "
-        "all (default: RECORDING_replay)", "DIR",
+        f"directory to create, for {POSES_FILE} (TUM), {TWISTS_FILE} and the bag {RESULT}; of "
+        "many, one for all (default: RECORDING_replay)", "DIR",
     )  # fmt: skip
     map: Path | None = option(
         "the map of the keypoints; of images, also markers or the result of map build, which "
@@ -169,7 +168,7 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
         if options.parquet is not None:
             tally.table = frame_table.FrameTable(recording, localizer, options.smooth)
         # Other files of the user stay.
-        names = POSES, TWISTS, BRIDGED, RESULT, fleet.MARKER, fleet.LOG
+        names = POSES_FILE, TWISTS_FILE, BRIDGED, RESULT, fleet.MARKER, fleet.LOG
         earlier = earlier_result(options, f"{RESULT}/metadata.yaml", out, names)
         with (
             atomic_directory(out, earlier) as built,

@@ -312,9 +312,6 @@ class _Recorder:
         if counts:
             figures["points_per_image"] = mean = float(np.mean(counts))
             said += f", {mean:.0f} points each"
-            if few := sum(count < args.points for count in counts):
-                said += f" (of {args.points} asked for; {few} frames see fewer, "
-                said += f"{counts.count(0)} of them none)"
             following = ["replay", out, "--params", f"{out}/{PARAMETERS}", "--out", f"{out}_poses"]
             following += ["--map", f"{out}/{MAP}"] if args.keypoints else []
         elif isinstance(world, Scene) and world.marker_map is not None:

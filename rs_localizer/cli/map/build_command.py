@@ -4,17 +4,16 @@
 
 from __future__ import annotations
 
-import argparse
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from tqdm import tqdm
 
 from rs_localizer.cli import earlier_result, stage, typed
-from rs_localizer.cli.options import ResultOptions, UsageError, argument, number, option
+from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.cli.recording_input import (
     ImageOptions,
     check_there,
@@ -30,7 +29,7 @@ from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME
 from rs_localizer.io.trajectories import Trajectory, write_tum
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.settings import build, write_parameters
-from rs_localizer.tools.mapping.anchors import Anchors, Distance, PointSight
+from rs_localizer.tools.mapping.anchors import Anchors, PointSight
 from rs_localizer.tools.mapping.build import Built, Given, build_map, result_rows
 from rs_localizer.tools.mapping.structure import Looked, Looker, look_through, require
 
@@ -84,9 +83,7 @@ class Options(ImageOptions, ResultOptions):
 
 
 def run(args: Options) -> None:
-    of_point = partial(_number, "--point")
-    points = [(name, of_point(s), of_point(u), of_point(v)) for name, s, u, v in args.point]
-    distance = _distance(args, [name for name, *_ in points])
+    points, distance = _given(args)
     require()
     check_there([args.recording])
     markers = None if args.markers is None else read_marker_map(args.markers)
@@ -108,32 +105,29 @@ def run(args: Options) -> None:
     _print_result(args, built, looked)
 
 
-def _distance(options: Options, names: list[str]) -> Distance | None:
-    """Return the given distance, after checking that each point is given in two images."""
+def _given(options: Options) -> tuple[list[_Point], tuple[str, str, float] | None]:
+    """Return the given points and distance, after checking that they go together."""
     if options.markers is not None and (options.point or options.distance):
         raise UsageError("give either --markers or --point and --distance")
+    try:
+        points = [(name, float(s), float(u), float(v)) for name, s, u, v in options.point]
+        metres = float(options.distance[2]) if options.distance else math.nan
+    except ValueError as error:
+        raise UsageError(f"--point and --distance: {error}") from error
     if options.distance is None:
-        if options.point:
+        if points:
             raise UsageError("--point needs --distance")
-        return None
-    one, other, text = options.distance
-    metres = _number("--distance", text)
+        return points, None
+    names, (one, other, _) = [name for name, *_ in points], options.distance
     if not metres > 0.0 or one == other:
-        raise UsageError(f"--distance: must be two points and metres, got {one} {other} {text}")
+        raise UsageError(f"--distance: must be two points and metres, got {one} {other} {metres}")
     for name in (one, other):
         if (count := names.count(name)) < 2:
             raise UsageError(
                 f"--distance: the point {name} must be given by --point in two images or more, it "
                 f"is in {count}"
             )
-    return Distance(one, other, metres)
-
-
-def _number(option: str, text: str) -> float:
-    try:
-        return number()(text)
-    except argparse.ArgumentTypeError as error:
-        raise UsageError(f"{option}: {error}") from error
+    return points, (one, other, metres)
 
 
 def _write(out: Path, built: Built, looked: Looked) -> None:

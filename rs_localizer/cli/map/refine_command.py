@@ -197,7 +197,4 @@ def _print_model(result: GlobalShutterModel, images: int, points: int) -> None:
             f"{1e3 * fit.deviation:.1f} ms fits best): the model is that of a global one"
         )
     elif fit is None and not shutter.readout_time:
-        why = "too few images follow each other"
-        if result.refined.apart:
-            why = "no smooth motion joins the images, each has a pose of its own: too little"
-        print(f"warning: {why} to show a rolling shutter: give it")
+        print("warning: no smooth motion joins enough images to show a rolling shutter: give it")

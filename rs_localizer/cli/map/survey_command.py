@@ -22,8 +22,6 @@ from rs_localizer.markers.prints import Marker
 from rs_localizer.tools.mapping.survey import MISFIT, Survey, survey
 from rs_localizer.tools.mapping.unknown_markers import Filmed, Spotted, Spotter, every_marker
 
-_LISTED = 12
-
 
 @dataclass(frozen=True, kw_only=True)
 class Options(ImageOptions, ResultOptions):
@@ -138,5 +136,4 @@ def _print_result(found: Survey, images: int) -> None:
 
 
 def _listed(markers: tuple[Marker, ...]) -> str:
-    more = f" and {len(markers) - _LISTED} more" if len(markers) > _LISTED else ""
-    return ", ".join(marker.name for marker in markers[:_LISTED]) + more
+    return ", ".join(marker.name for marker in markers)

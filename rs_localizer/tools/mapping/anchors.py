@@ -8,6 +8,7 @@ take part in the adjustment, where they hold frame, size and shape of the map.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,22 +29,12 @@ _LEAST_CORNERS = 4
 _DEVIATION = 0.001
 
 
-@dataclass(frozen=True, slots=True)
-class PointSight:
+class PointSight(NamedTuple):
     """A named point in an image."""
 
     name: str
     view: int  # row of the views
     pixel: tuple[float, float]  # raw
-
-
-@dataclass(frozen=True, slots=True)
-class Distance:
-    """Measured distance between two named points."""
-
-    one: str
-    other: str
-    metres: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +43,7 @@ class Anchors:
 
     marker_map: MarkerMap | None = None
     sights: tuple[PointSight, ...] = ()
-    distance: Distance | None = None
+    distance: tuple[str, str, float] | None = None  # two names, and m between them
 
     @property
     def names(self) -> list[str]:
@@ -111,20 +102,21 @@ def placement(
     across = rotations[:, :, 0]
     axis, down = np.linalg.eigh(across.T @ across)[1][:, 0], rotations[:, :, 1].mean(axis=0)
     turn = upright(axis if axis @ down >= 0.0 else -axis)
-    if (known := anchors.distance) is None:
+    if anchors.distance is None:
         return Placement(
             Similarity(1.0, turn, -turn @ positions[0]), False, "the scale is undetermined"
         )
-    rows = [anchors.corners + anchors.names.index(name) for name in (known.one, known.other)]
+    one, other, metres = anchors.distance
+    rows = [anchors.corners + anchors.names.index(name) for name in (one, other)]
     apart = float(np.linalg.norm(np.subtract(*triangulated.points[rows])))
     if not apart > 0.0:  # NaN: one of them is seen by one image only, or far away
         raise ValueError(
-            f"the distance {known.one} {known.other} gives no scale: each point must be given in "
-            "two images or more that see it from different places"
+            f"the distance {one} {other} gives no scale: each point must be given in two images or "
+            "more that see it from different places"
         )
-    scale = known.metres / apart
+    scale = metres / apart
     similarity = Similarity(scale, turn, -scale * turn @ positions[0])
-    return Placement(similarity, True, f"the distance {known.one} {known.other}")
+    return Placement(similarity, True, f"the distance {one} {other}")
 
 
 def determined_corners(marker_map: MarkerMap, triangulated: Triangulated) -> BoolArray:

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.markers.maps import MarkerMap, wall
-from rs_localizer.tools.mapping.anchors import Anchors, Distance, PointSight, placement
+from rs_localizer.tools.mapping.anchors import Anchors, PointSight, placement
 from rs_localizer.tools.mapping.gauge import Similarity
 from rs_localizer.tools.mapping.triangulation import Triangulated
 
@@ -67,7 +67,7 @@ def sights(*names: str) -> tuple[PointSight, ...]:
 
 def test_a_distance_gives_the_scale():
     points = np.array([[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
-    placement = placed(Anchors(None, sights("a", "b"), Distance("a", "b", 3.0)), points)
+    placement = placed(Anchors(None, sights("a", "b"), ("a", "b", 3.0)), points)
     assert placement.scaled
     assert placement.similarity.scale == pytest.approx(1.5)
     # Without anything better, the picture's rows are level: y of the camera's frame is down.
