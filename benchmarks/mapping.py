@@ -7,7 +7,6 @@ python -m benchmarks.mapping bend surveys walks
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -349,10 +348,7 @@ def _built(film: Film, room: Array, markers: int, rng: np.random.Generator) -> B
     inputs = Given(views, camera, anchors, _READOUT, str(camera.scan_direction))
     descriptors = np.zeros((len(room), 1), np.float32)
     structure = Structure(rows, seen, start, descriptors, camera, (count,))
-    return built_from(
-        inputs, structure, (rows, seen, start), camera,
-        lambda name, total: nullcontext(lambda steps: None),
-    )  # fmt: skip
+    return built_from(inputs, structure, (rows, seen, start), camera)
 
 
 def _localized(

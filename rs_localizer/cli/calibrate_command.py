@@ -14,8 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from rs_localizer.cli import refuse_existing, typed, write_all
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.cli.recording_input import (
@@ -178,11 +176,10 @@ def _calibrated(
 ) -> CameraCalibration:
     """Calibrate a camera by its images and print the result; ``any_axis``: none was given."""
     one = calibrate_either_axis if any_axis else calibrate
-    with tqdm(total=len(source.images), unit="image", desc="localize", disable=None) as bar:
-        found = one(
-            source.camera, source.images, intrinsics=source.find_lens, imu=source.imu,
-            own_stamps=source.own_stamps, done=bar.update,
-        )  # fmt: skip
+    found = one(
+        source.camera, source.images, intrinsics=source.find_lens, imu=source.imu,
+        own_stamps=source.own_stamps,
+    )  # fmt: skip
     print("\n".join(verdict.table(found, args.rate)))
     if source.find_lens:
         print("\n".join(verdict.of_lens(found)))

@@ -8,10 +8,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from rs_localizer.cli import earlier_result, typed
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
@@ -87,15 +85,12 @@ def detect(args: Options) -> Figures:
                 cameras = {name: own for name, (own, _) in rig.items()}
             for name, own in cameras.items():
                 of = settings.of_cameras.get(name, settings)
-                with (
-                    opened(own) as source,
-                    tqdm(total=source.total, unit="image", desc="detect", disable=None) as bar,
-                ):
+                with opened(own) as source:
                     shots: Shots = source.shots
                     if name not in ("", settings.cameras[0]):  # what goes along is of the first
                         shots = (shot for shot in shots if not isinstance(shot, Carried))
                     options = offline.DetectionOptions(args.with_images, of.scan_direction, name)
-                    found = detect_images(shots, bag, options, bar)
+                    found = detect_images(shots, bag, options)
                 count, median = len(found.counts), float(np.median(found.counts))
                 every.append((found.images, count, median))
                 said = f"{count} of {found.images} images, {median:.0f} {kind}"
@@ -115,7 +110,7 @@ def detect(args: Options) -> Figures:
     return figures | {"warnings": "; ".join(warnings)}
 
 
-Detection = Callable[["Shots", BagWriter, "offline.DetectionOptions", Any], "Extraction"]
+Detection = Callable[[Shots, BagWriter, offline.DetectionOptions], Extraction]
 
 
 def _of_markers(args: Options) -> tuple[Mapping[str, float], Detection]:
@@ -126,11 +121,11 @@ def _of_markers(args: Options) -> tuple[Mapping[str, float], Detection]:
     marker_map, config = find_map(args), DetectorConfig()
 
     def detect_images(
-        shots: Shots, bag: BagWriter, options: offline.DetectionOptions, bar: Any
+        shots: Shots, bag: BagWriter, options: offline.DetectionOptions
     ) -> Extraction:
         notices: Counter[str] = Counter()
         detector = FrameDetector(config, lambda _, text: notices.update([text]), marker_map)
-        found = record_markers(shots, detector, bag, options, bar.update)
+        found = record_markers(shots, detector, bag, options)
         texts = notices.most_common(3)
         found.notes = tuple(f"({number} images): {text}" for text, number in texts)
         return found
@@ -144,6 +139,4 @@ def _of_features(args: Options) -> tuple[Mapping[str, float], Detection]:
             raise UsageError(f"--{name} is for markers; give it or --features")
     most = args.max_keypoints or FeatureConfig().max_keypoints
     extractor = FrameExtractor(FeatureConfig(features=args.features or "", max_keypoints=most))
-    return {}, lambda shots, bag, options, bar: record_features(
-        shots, extractor, bag, options, bar.update
-    )
+    return {}, lambda shots, bag, options: record_features(shots, extractor, bag, options)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -160,8 +160,7 @@ def print_images(
 class Source:
     """Images, as far as they are open."""
 
-    shots: Iterator[Shot] | Iterator[Shot | Carried]
-    total: int | None  # None: unknown
+    shots: Iterator[Shot | Carried]  # with a bar
     clock: ImageClock | None  # of images without times of their own
 
 
@@ -186,7 +185,7 @@ def opened(args: ImageOptions, calibrated: bool = True) -> Iterator[Source]:
             if camera is None and (calibrated or CAMERA_INFO_TYPE in bag.topics.values()):
                 option = "-r camera_info:=TOPIC, or give --camera FILE"
                 info = bag.find_topic((CAMERA_INFO_TYPE,), topics.get(CAMERA_INFO), option)
-            yield Source(from_bag(bag, topic, info, camera), bag.count([topic]), None)
+            yield Source(_with_bar(from_bag(bag, topic, info, camera), bag.count([topic])), None)
         return
     if args.remaps:
         raise UsageError("-r names topics of a bag")
@@ -204,7 +203,14 @@ def opened(args: ImageOptions, calibrated: bool = True) -> Iterator[Source]:
         )
     else:
         shots = from_video(path, camera, clock)
-    yield Source(shots, total, clock)
+    yield Source(_with_bar(shots, total), clock)
+
+
+def _with_bar(shots: Iterable[Shot | Carried], total: int | None) -> Iterator[Shot | Carried]:
+    with tqdm(total=total, unit="image", disable=None) as bar:
+        for shot in shots:
+            yield shot
+            bar.update(isinstance(shot, Shot))
 
 
 def each_image(
@@ -213,8 +219,7 @@ def each_image(
     """Yield the images of a recording, each with its lens, and then say how they were taken."""
     tally = ImageTally()
     with opened(args, calibrated) as source:
-        seen = usable(source.shots, direction, tally)
-        for _, image, camera in tqdm(seen, unit="image", desc="detect", disable=None):
+        for _, image, camera in usable(source.shots, direction, tally):
             yield image, camera
     print_images(tally.refused, source.clock)
 

@@ -3,7 +3,7 @@
 """Offline detection: images -> a recording of correspondences or keypoints, as the nodes do."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -69,20 +69,19 @@ class DetectionOptions:
 
 def record_markers(
     shots: Iterable[Shot | Carried], detector: FrameDetector, bag: BagWriter,
-    options: DetectionOptions, done: Callable[[], object] = lambda: None,
+    options: DetectionOptions,
 ) -> Extraction:  # fmt: skip
     """Write the corners of all images that show any, each with its CameraInfo.
 
     Args:
         shots: the images, and what else of their recording is to be kept.
-        done: called after each image.
 
     Raises:
         ValueError: when no image shows anything, or images and calibration differ in size.
     """
     found, others, faults = Extraction(), Counter[str](), Counter[str]()
     kept = _kept(shots, bag, found)
-    for shot, image, _ in usable(kept, options.scan_direction, found, done):
+    for shot, image, _ in usable(kept, options.scan_direction, found):
         detected = detector.detect(image)
         others.update(detected.detections.unknown)
         faults.update(detected.detections.faults)
@@ -133,14 +132,12 @@ def _kept(shots: Iterable[Shot | Carried], bag: BagWriter, found: Extraction) ->
 
 
 def usable(
-    shots: Iterable[Shot | Carried], scan_direction: str, tally: ImageTally,
-    done: Callable[[], object] = lambda: None,
-) -> Iterator[tuple[Shot, Image, Camera | None]]:  # fmt: skip
+    shots: Iterable[Shot | Carried], scan_direction: str, tally: ImageTally
+) -> Iterator[tuple[Shot, Image, Camera | None]]:
     """Yield the usable images, each with its camera, without a readout time, if it is known.
 
     Args:
         tally: of all images.
-        done: called after each of them.
 
     Raises:
         ValueError: when they and their calibration differ in size, or, without one, they are of
@@ -169,7 +166,6 @@ def usable(
                     "size"
                 )
             yield shot, image, camera
-        done()
 
 
 class _Cameras:
@@ -229,7 +225,7 @@ def _write(bag: BagWriter, shot: Shot, topic: str, message: Any, options: Detect
 
 def record_features(
     shots: Iterable[Shot | Carried], extractor: FrameExtractor, bag: BagWriter,
-    options: DetectionOptions, done: Callable[[], object] = lambda: None,
+    options: DetectionOptions,
 ) -> Extraction:  # fmt: skip
     """Write the keypoints of all images that have any, each with its CameraInfo.
 
@@ -238,7 +234,7 @@ def record_features(
     """
     extraction = Extraction()
     kept = _kept(shots, bag, extraction)
-    for shot, image, _ in usable(kept, options.scan_direction, extraction, done):
+    for shot, image, _ in usable(kept, options.scan_direction, extraction):
         extracted = extractor.detect(image)
         if len(extracted.features):
             extraction.counts.append(len(extracted.features))

@@ -3,7 +3,6 @@
 """A camera by a recording: readout time with an honest deviation, direction, lens, oddities."""
 
 import math
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -272,7 +271,6 @@ def calibrate_either_axis(
 def calibrate(
     camera: Camera, images: list[ImagePoints], *, intrinsics: bool = False,
     imu: ImuRecording | None = None, own_stamps: bool = True,
-    done: Callable[[], object] = lambda: None,
 ) -> CameraCalibration:  # fmt: skip
     """Estimate readout time and lens of a camera from a recording in which it moves.
 
@@ -284,7 +282,6 @@ def calibrate(
         imu: how it goes with the camera is to be found; its turns then help to find all else.
         own_stamps: stamps are the camera's; otherwise those of a file, which are the images' own
             only where they are uneven.
-        done: called after each image.
 
     Raises:
         ValueError: when the recording determines nothing, saying what was found.
@@ -294,7 +291,7 @@ def calibrate(
     if len(images) < _LEAST_IMAGES:
         raise ValueError(f"{len(images)} images show the map, at least {_LEAST_IMAGES} are needed")
     stamps = examine((taken - taken[0]) * 1e-9)
-    results = localize_each(camera, images, done)
+    results = localize_each(camera, images)
     localized = sum(map(bool, results))
     if localized < _LEAST_IMAGES:
         failures = [str(result) for result in results if not result]

@@ -10,9 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from tqdm import tqdm
-
-from rs_localizer.cli import earlier_result, stage, typed
+from rs_localizer.cli import earlier_result, typed
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.cli.recording_input import (
     ImageOptions,
@@ -46,11 +44,9 @@ def shutter_of(args: Options) -> tuple[float | None, str | None]:
 
 def look_at_images(args: Options, points: Sequence[_Point], looker: Looker) -> Looked:
     """Look at this many images a second, and at those in which points are given."""
-    with opened(args, calibrated=False) as source, tqdm(
-        total=source.total, unit="image", desc="look", disable=None
-    ) as bar:  # fmt: skip
+    with opened(args, calibrated=False) as source:
         moments = [seconds for _, seconds, _, _ in points]
-        looked = look_through(source.shots, looker, _IMAGES_PER_SECOND, moments, bar.update)
+        looked = look_through(source.shots, looker, _IMAGES_PER_SECOND, moments)
     if not looked.views:
         why = "; ".join(looked.refused.values())
         raise ValueError(f"{args.recording} has no image that can be read; {why}")
@@ -100,7 +96,7 @@ def run(args: Options) -> None:
             inputs = Given(looked.views, looked.camera, anchors, *shutter, frame)
             folder = out / COLMAP
             folder.mkdir()
-            built = build_map(inputs, folder, stage)
+            built = build_map(inputs, folder)
         _write(out, built, looked)
     _print_result(args, built, looked)
 

@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from rs_localizer.cli import earlier_result, refuse_existing, write_all
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
@@ -33,8 +32,6 @@ from rs_localizer.settings import build
 from rs_localizer.tools.mapping.global_shutter import GlobalShutterModel, undo_shutter
 from rs_localizer.tools.mapping.map_keypoints import MapFreedom, RecordedMap, from_recording
 from rs_localizer.tools.mapping.refinement import RefinedMap, refine
-
-_step = partial(print, "adjusted:", flush=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,17 +64,15 @@ def run(args: Options) -> None:
     with open_bag(args.recording) as bag:
         lens, clouds = recorded(args, bag, config, landmarks)
     camera = replace(lens, readout_time=config.readout_time, scan_direction=config.scan_direction)
-    with tqdm(total=len(clouds), unit="image", desc="localize", disable=None) as bar:
-        localized = from_recording(camera, clouds, landmarks, bar.update)
+    localized = from_recording(camera, clouds, landmarks)
     spread = config.map_deviation
     deviations = np.full(len(localized.landmarks), spread) if spread > 0.0 else None
     freedom = MapFreedom(
         readout_time=not config.readout_time > 0.0, lens=args.intrinsics, deviations=deviations
     )
     refined = refine(
-        camera, localized.seen, localized.start, freedom, stamp_offset=config.stamp_offset,
-        done=_step,
-    )  # fmt: skip
+        camera, localized.seen, localized.start, freedom, stamp_offset=config.stamp_offset
+    )
     _print_result(localized, refined)
     if refined.readout_check is not None:
         refined.readout_check.refuse()
@@ -144,7 +139,7 @@ def _undo_shutter(args: Options, folder: Path, out: Path) -> None:
     known = config.readout_time or "scan_direction" in values
     shutter = config.readout_time or None, str(config.scan_direction) if known else None
     with atomic_directory(out, earlier_result(args, "images.txt", out)) as built:
-        result = undo_shutter(camera, model, stamps, shutter, args.intrinsics, _step)
+        result = undo_shutter(camera, model, stamps, shutter, args.intrinsics)
         if result.readout_check is not None:
             result.readout_check.refuse()
         built.mkdir()

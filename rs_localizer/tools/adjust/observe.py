@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Images with their correspondences, one pose each, as an adjustment takes them."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
+from tqdm import tqdm
 
 from rs_localizer.config import CalibrationErrors
 from rs_localizer.core.arrays import Array
@@ -54,10 +55,9 @@ def in_order(images: Iterable[Image]) -> list[Image]:
 
 
 def localize_each(
-    camera: Camera, images: Sequence[ImagePoints | Correspondences],
-    done: Callable[[], object] = lambda: None,
-) -> list[Estimate | Failure]:  # fmt: skip
-    """Localize each image on its own: the readout time need not be known.
+    camera: Camera, images: Sequence[ImagePoints | Correspondences]
+) -> list[Estimate | Failure]:
+    """Localize each image on its own, with a bar: the readout time need not be known.
 
     Nor need the lens be right: where it is too wrong for a pose to be published, a rough one is a
     start for an estimator that finds the lens as well.
@@ -66,13 +66,12 @@ def localize_each(
     gate = _ROUGH * localizer.config.inlier_threshold
     rough = Localizer(camera, inlier_threshold=gate, calibration=_ANY_LENS)
     results = []
-    for image in images:
+    for image in tqdm(images, "localize", unit="image", disable=None):
         sights = localizer.sights(image.points, image.pixels)
         result = localizer.find(sights)
         if isinstance(result, Failure) and result.reason in _OF_THE_LENS:
             result = rough.find(sights)
         results.append(result)
-        done()
     return results
 
 

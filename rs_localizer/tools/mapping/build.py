@@ -11,12 +11,13 @@
 4. All landmarks are triangulated with that motion, and so is what gives the map its metres.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from tqdm import tqdm
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array, IntArray
@@ -49,7 +50,6 @@ from rs_localizer.tools.mapping.refinement import (
 from rs_localizer.tools.mapping.structure import (
     LEAST_VIEWS,
     SeenImage,
-    Stage,
     Structure,
     build_structure,
     check_views,
@@ -63,9 +63,8 @@ _THRESHOLD = 4.0
 
 
 def track_on_map(
-    views: Sequence[SeenImage], structure: Structure, camera: Camera,
-    done: Callable[[], object] = lambda: None,
-) -> tuple[IntArray, MapObservations, Start]:  # fmt: skip
+    views: Sequence[SeenImage], structure: Structure, camera: Camera
+) -> tuple[IntArray, MapObservations, Start]:
     """Return rows (k,) of the views with a pose, and what they show.
 
     Keyframes are where COLMAP has them, the others are localized.
@@ -74,14 +73,13 @@ def track_on_map(
         views: in the order of their stamps.
         structure: of about the right size, in metres.
         camera: with its readout time; 0: a global shutter, or unknown.
-        done: called after each view.
     """
     seen, start = structure.seen, structure.start
     frames = _frames(structure, camera)
     ends = np.searchsorted(seen.images, np.arange(len(structure.views) + 1)).tolist()
     keyframes = {view: k for k, view in enumerate(structure.views.tolist())}
     rows, poses, points, pixels = [], [], [], []
-    for row, view in enumerate(views):
+    for row, view in enumerate(tqdm(views, "track", unit="image", disable=None)):
         k = keyframes.get(row)
         if k is not None:
             own = slice(ends[k], ends[k + 1])
@@ -99,7 +97,6 @@ def track_on_map(
                 points.append(found.inliers["id"].astype(np.int64))
                 pixels.append(inlier_columns(found, "uv"))
                 rows.append(row)
-        done()
     counts = [len(of) for of in points]
     shown = MapObservations(
         np.array([views[row].stamp_ns for row in rows], np.int64),
@@ -204,33 +201,31 @@ class Built:
         return times, self.positions, Rotation.from_matrix(self.rotations).as_quat()
 
 
-def build_map(inputs: Given, folder: Path, stage: Stage) -> Built:
+def build_map(inputs: Given, folder: Path) -> Built:
     """Build a map.
 
     Args:
         inputs: the images, and what is known of them.
         folder: for COLMAP's files, which stay.
-        stage: of each part: its name and number of steps in; what counts them comes out.
 
     Raises:
         ValueError: when the images make no map, saying what was found.
     """
     check_views(inputs.views)
     keyframes = choose_keyframes(inputs.views)
-    structure = _structure(inputs, keyframes, folder, stage)
+    structure = _structure(inputs, keyframes, folder)
     camera = replace(
         structure.camera,
         readout_time=inputs.readout_time or 0.0,
         scan_direction=likely_axis(structure.camera.size, inputs.scan_direction),
     )
-    with stage("track", len(inputs.views)) as step:
-        tracked = track_on_map(inputs.views, structure, camera, lambda: step(1))
-    return built_from(inputs, structure, tracked, camera, stage)
+    tracked = track_on_map(inputs.views, structure, camera)
+    return built_from(inputs, structure, tracked, camera)
 
 
 def built_from(
     inputs: Given, structure: Structure, tracked: tuple[IntArray, MapObservations, Start],
-    camera: Camera, stage: Stage,
+    camera: Camera,
 ) -> Built:  # fmt: skip
     """Build a map from a first structure.
 
@@ -243,7 +238,7 @@ def built_from(
     """
     rows, shown, start = tracked
     used, adjusted, near = adjusted_part(shown, start, ADJUSTED)
-    refined, shutter, check = _refined(inputs, adjusted, near, camera, stage)
+    refined, shutter, check = _refined(inputs, adjusted, near, camera)
     if refined.fit_share < LEAST_FIT:  # the motion is open, and the map may follow it
         lens = "" if inputs.camera is not None else (
             f"; COLMAP found a focal length of {structure.camera.focal_length:.0f} px, which a "
@@ -284,10 +279,10 @@ def built_from(
     )  # fmt: skip
 
 
-def _structure(inputs: Given, keyframes: IntArray, folder: Path, stage: Stage) -> Structure:
+def _structure(inputs: Given, keyframes: IntArray, folder: Path) -> Structure:
     """Return the first structure, of about the right size."""
     stamps = {row: inputs.views[row].stamp_ns for row in keyframes.tolist()}
-    structure = build_structure(inputs.views[0].image.parent, stamps, inputs.camera, folder, stage)
+    structure = build_structure(inputs.views[0].image.parent, stamps, inputs.camera, folder)
     total = len(keyframes)
     if structure.parts[0] < max(LEAST_VIEWS, _LEAST_PART * total):
         listed = " and ".join(map(str, structure.parts))
@@ -305,7 +300,7 @@ def usual_size(seen: MapObservations, start: Start) -> Similarity:
 
 
 def _refined(
-    inputs: Given, observations: MapObservations, start: Start, camera: Camera, stage: Stage
+    inputs: Given, observations: MapObservations, start: Start, camera: Camera
 ) -> tuple[RefinedMap, ShutterFit | None, ReadoutCheck | None]:
     """Return the refined map, a shutter that was unknown or wrong, the check of a given one."""
     freedom = replace(colmap_freedom(inputs.camera is None), drifts=_MODES)
@@ -321,9 +316,7 @@ def _refined(
             camera, observations, start, shown, places
         )
         freedom = replace(freedom, deviations=deviations)
-    given = inputs.readout_time
-    with stage("refine", 3 if given is not None else 6) as step:
-        return refine_with_shutter(camera, observations, start, freedom, given, lambda _: step(1))
+    return refine_with_shutter(camera, observations, start, freedom, inputs.readout_time)
 
 
 def _kept(triangulated: Triangulated, motion: ViewMotion) -> IntArray:

@@ -8,7 +8,7 @@ point, to where a camera at the pose of one row of its image sees that point. Th
 keypoint stays.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,7 +50,6 @@ class GlobalShutterModel:
 def undo_shutter(
     camera: Camera, model: Model, stamps_ns: Mapping[str, int],
     shutter: tuple[float | None, str | None], lens: bool,
-    done: Callable[[str], object] = lambda text: None,
 ) -> GlobalShutterModel:  # fmt: skip
     """Return the model that a global shutter would have given.
 
@@ -60,7 +59,6 @@ def undo_shutter(
         stamps_ns: of the images, by their names; no two are the same.
         shutter: readout time, s, None: estimated; and scan direction, None: unknown.
         lens: whether the lens is adjusted.
-        done: called with each part of the work that is done.
 
     Raises:
         ValueError: when the images do not determine it, saying what was found.
@@ -77,7 +75,7 @@ def undo_shutter(
         )
     camera = replace(camera, scan_direction=likely_axis(camera.size, shutter[1]))
     refined, found, check = refine_with_shutter(
-        camera, some, near, colmap_freedom(lens), shutter[0], done
+        camera, some, near, colmap_freedom(lens), shutter[0]
     )
     motion = ViewMotion(used, refined.times, refined)
     projected = motion.sights(seen.images, seen.landmarks, seen.pixels)

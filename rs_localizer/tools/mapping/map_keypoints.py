@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -242,22 +242,20 @@ class RecordedMap:
 
 
 def from_recording(
-    camera: Camera, clouds: Sequence[Correspondences], landmarks: Map | None = None,
-    done: Callable[[], object] = lambda: None,
-) -> RecordedMap:  # fmt: skip
+    camera: Camera, clouds: Sequence[Correspondences], landmarks: Map | None = None
+) -> RecordedMap:
     """Return images with a pose, and the landmarks that they show.
 
     Args:
         camera: with its readout time, where that is known.
         clouds: one an image.
         landmarks: the map; None: that of the recording, by the points that it shows.
-        done: called after each image.
 
     Raises:
         ValueError: when points are not of the map, or no image has a pose.
     """
     images = in_order(clouds)
-    results = localize_each(camera, images, done)
+    results = localize_each(camera, images)
     if landmarks is None:
         landmarks = _own_map(images)
     posed = [

@@ -9,7 +9,6 @@ adjustment with a global shutter bends the map by what the camera moved while it
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -141,20 +140,17 @@ class Refinement:
             return Problem(views, self.state)
         return Problem(views, self.state, deviations=self.deviations, floating=self.floating)
 
-    def solved(self, done: Callable[[str], object]) -> RefinedMap:
-        """Return the most likely map and motion; ``done`` is called after each part."""
+    def solved(self) -> RefinedMap:
+        """Return the most likely map and motion."""
         # The motion that goes with the map as it is.
         held = replace(self.freedom, readout_time=False, lens=False)
         motion = self.problem(held, held=True)
         self.state, before = fit_with_noise(motion, self.state, motion.noise(self.state, np.inf))
-        done("motion")
         problem = self.problem(self.freedom)
         self.state, deviation = fit_with_noise(problem, self.state, before)
-        done("map")
         if (calmer := acceleration_prior(self.state, self.freedom)) is not None:
             self.freedom, problem = calmer, self.problem(calmer)
             self.state, deviation = fit_with_noise(problem, self.state, deviation)
-            done("accelerations")
         return self._result(problem, before, deviation)
 
     def _result(self, problem: Problem, before: float, deviation: float) -> RefinedMap:
@@ -289,7 +285,7 @@ class RefinedMap(Adjusted):
 
 def refine(
     camera: Camera, seen: MapObservations, start: Start, freedom: MapFreedom | None = None, *,
-    stamp_offset: float = 0.0, done: Callable[[str], object] = lambda text: None,
+    stamp_offset: float = 0.0,
 ) -> RefinedMap:  # fmt: skip
     """Return the most likely map and motion.
 
@@ -300,7 +296,6 @@ def refine(
             stays where this has it.
         freedom: further unknowns (default: landmarks and motion only).
         stamp_offset: s from a stamp to the first row's exposure.
-        done: called with each part of the work that is done.
 
     Raises:
         ValueError: when the images make no single map, or are too many.
@@ -308,7 +303,7 @@ def refine(
     check(seen, len(start.points))
     refinement = Refinement(camera, stamp_offset, seen, start, freedom or MapFreedom())
     try:
-        return refinement.solved(done)
+        return refinement.solved()
     except Undetermined as error:
         raise ValueError(f"the map cannot be refined: {error}") from error
 
@@ -376,8 +371,7 @@ def colmap_freedom(lens: bool) -> MapFreedom:
 
 
 def fit_shutter(
-    camera: Camera, observations: MapObservations, start: Start, freedom: MapFreedom,
-    done: Callable[[str], object],
+    camera: Camera, observations: MapObservations, start: Start, freedom: MapFreedom
 ) -> tuple[RefinedMap, ShutterFit | None]:  # fmt: skip
     """Refine the map with the shutter that explains the images best.
 
@@ -388,7 +382,6 @@ def fit_shutter(
     Args:
         camera: its lens, and the axis of its scan.
         observations, start, freedom: as of :func:`refine`.
-        done: called with each part of the work that is done.
 
     Returns:
         the map, and what the shutter was found to be; None: too few images follow each other, or
@@ -399,7 +392,7 @@ def fit_shutter(
     """
     camera, smooth = replace(camera, readout_time=0.0), None
     with suppress(ValueError):  # what is wrong with the images is raised below
-        smooth = _of_one_motion(camera, observations, start, freedom, done)
+        smooth = _of_one_motion(camera, observations, start, freedom)
         best, errors = smooth[0], global_errors(camera, observations, start)
         noise = noise_of(errors[np.isfinite(errors)] ** 2, np.inf)  # px, of the first guess
         if best.fit_share >= LEAST_FIT and best.after <= noise:
@@ -415,7 +408,7 @@ def fit_shutter(
 
 def refine_with_shutter(
     camera: Camera, observations: MapObservations, start: Start, freedom: MapFreedom,
-    given: float | None, done: Callable[[str], object],
+    given: float | None,
 ) -> tuple[RefinedMap, ShutterFit | None, ReadoutCheck | None]:  # fmt: skip
     """Refine the map with a given readout time (s), and check it.
 
@@ -425,11 +418,11 @@ def refine_with_shutter(
     check = None
     if given is not None:
         known = replace(camera, readout_time=given)
-        refined = refine(known, observations, start, freedom, done=done)
+        refined = refine(known, observations, start, freedom)
         check = refined.readout_check
         if check is None or not check.differs:
             return refined, None, check
-    return *fit_shutter(camera, observations, start, freedom, done), check
+    return *fit_shutter(camera, observations, start, freedom), check
 
 
 def global_errors(camera: Camera, observations: MapObservations, start: Start) -> Array:
@@ -439,17 +432,16 @@ def global_errors(camera: Camera, observations: MapObservations, start: Start) -
 
 
 def _of_one_motion(
-    camera: Camera, observations: MapObservations, start: Start, freedom: MapFreedom,
-    done: Callable[[str], object],
+    camera: Camera, observations: MapObservations, start: Start, freedom: MapFreedom
 ) -> tuple[RefinedMap, ShutterFit | None]:  # fmt: skip
     """Refine by one smooth motion through successive images; see :func:`fit_shutter`."""
     from scipy.stats import wilcoxon  # takes a second
 
-    still = refine(camera, observations, start, freedom, done=done)
+    still = refine(camera, observations, start, freedom)
     if not still.tells_readout:
         return still, None
     free = replace(freedom, readout_time=True)
-    rolling = refine(still.camera, observations, start, free, done=done)
+    rolling = refine(still.camera, observations, start, free)
     gains = _costs(still, still, observations) - _costs(rolling, still, observations)
     shutter = ShutterFit(
         readout_time=rolling.camera_as_found.readout_time,

@@ -15,8 +15,8 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -25,6 +25,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from rs_localizer.config import FeatureKind
 from rs_localizer.core.arrays import Array, IntArray
@@ -54,8 +55,6 @@ _FEATURES, _THREADS, _SEED = 2000, 1, 0
 # COLMAP has the corner of the first pixel at 0, 0; here that is its centre.
 HALF = 0.5
 
-Stage = Callable[[str, int], AbstractContextManager[Callable[[int], object]]]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Structure:
@@ -82,8 +81,8 @@ def image_name(row: int) -> str:
 
 
 def build_structure(
-    images: Path, keyframes: Mapping[int, int], lens: Camera | None, folder: Path, stage: Stage
-) -> Structure:  # fmt: skip
+    images: Path, keyframes: Mapping[int, int], lens: Camera | None, folder: Path
+) -> Structure:
     """Reconstruct the largest connected part of the keyframes.
 
     Args:
@@ -91,8 +90,6 @@ def build_structure(
         keyframes: rows of the views, and their stamps, ns.
         lens: of all images, which is believed; None: COLMAP calibrates a simple radial camera.
         folder: for COLMAP's database and model; they stay.
-        stage: a context for each part of the work: its name and number of steps in, what counts
-            them out.
 
     Raises:
         ValueError: when the images do not determine a structure, or COLMAP fails, saying why.
@@ -108,7 +105,7 @@ def build_structure(
         "threads": _THREADS,
     }
     (folder / _TASK).write_text(json.dumps(task), encoding="utf-8")
-    said = _run(folder / _TASK, stage)
+    said = _run(folder / _TASK)
     (folder / _TASK).unlink()
     if not said["parts"]:
         raise ValueError(
@@ -161,7 +158,7 @@ def pairs_of(count: int) -> list[tuple[int, int]]:
     return sorted(pairs | {(i, j) for i in every for j in every if i < j})
 
 
-def _run(task: Path, stage: Stage) -> dict[str, Any]:
+def _run(task: Path) -> dict[str, Any]:
     """Return the task's result; name a process that dies with the last that it said."""
     command = [sys.executable, str(_SCRIPT), str(task)]
     # Without it a script would import from its own folder first.
@@ -169,17 +166,16 @@ def _run(task: Path, stage: Stage) -> dict[str, Any]:
     result: dict[str, Any] = {}
     with TemporaryFile("w+", encoding="utf-8", errors="replace") as log, subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=log, text=True, env=environment
-    ) as process, ExitStack() as stages:  # fmt: skip
+    ) as process, ExitStack() as bars:  # fmt: skip
         try:
-            step: Callable[[int], object] = lambda count: None  # noqa: E731
             assert process.stdout is not None
             for line in process.stdout:
                 match line.split():
                     case ["stage", name, total]:
-                        stages.close()
-                        step = stages.enter_context(stage(name, int(total)))
+                        bars.close()
+                        bar = bars.enter_context(tqdm(total=int(total), desc=name, disable=None))
                     case ["step", count]:
-                        step(int(count))
+                        bar.update(int(count))
                     case ["result", *_]:
                         result = json.loads(line.removeprefix("result"))
             process.wait()
@@ -202,8 +198,6 @@ LEAST_VIEWS = 3
 # COLMAP gets all views of a short recording and this many a second of a long one: at a turn of 60
 # degrees a second, neighbours have three quarters of a picture of 60 degrees in common.
 _KEYFRAMES, _KEYFRAMES_PER_SECOND = 60, 4.0
-# After this many images without features the rest is refused: two seconds of a usual video.
-_EARLY_VIEWS = 30
 # Images a hair before their time are in time.
 _EARLY = 0.9
 
@@ -261,20 +255,18 @@ class Looked(ImageTally):
 
 
 def look_through(
-    shots: Iterable[Shot | Carried], looker: Looker, rate: float, moments: Sequence[float],
-    done: Callable[[], object],
-) -> Looked:  # fmt: skip
+    shots: Iterable[Shot | Carried], looker: Looker, rate: float, moments: Sequence[float]
+) -> Looked:
     """Look at the images that are kept: this many a second, and the first ones at or after moments.
 
     Args:
         moments: s after the first image.
-        done: called after each image.
 
     Raises:
-        ValueError: for a camera that changes, or images without features.
+        ValueError: for a camera that changes.
     """
     found = Looked()
-    for _, image, camera in usable(shots, ScanDirection.TOP_TO_BOTTOM, found, done):
+    for _, image, camera in usable(shots, ScanDirection.TOP_TO_BOTTOM, found):
         if found.views and camera is not found.camera:
             raise ValueError("the camera changes within the recording; cut it there")
         found.camera = camera
@@ -284,8 +276,6 @@ def look_through(
         due_ns = 1e9 * _EARLY / rate
         if asked or not found.views or image.stamp_ns - found.views[-1].stamp_ns >= due_ns:
             found.views.append(looker.detect_in(image))
-            if len(found.views) == _EARLY_VIEWS:
-                check_features(found.views)
     return found
 
 
@@ -293,11 +283,6 @@ def check_views(views: Sequence[SeenImage]) -> None:
     """Refuse (``ValueError``), before minutes of work, views that will make no map."""
     if len(views) < LEAST_VIEWS:
         raise ValueError(f"{len(views)} images make no map; at least {LEAST_VIEWS} are needed")
-    check_features(views)
-
-
-def check_features(views: Sequence[SeenImage]) -> None:
-    """Refuse (``ValueError``) views that show too little."""
     features = float(np.median([len(view.features) for view in views]))
     if features < _FEW_FEATURES:
         raise ValueError(

@@ -4,7 +4,6 @@
 
 import subprocess
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 
 import cv2
@@ -55,8 +54,7 @@ def test_the_lens_is_the_same_for_colmap(model, D):
 def build(images: Path, folder: Path, count: int) -> structures.Structure:
     folder.mkdir()
     rows = {k: k for k in range(count)}
-    silent = lambda *_: nullcontext(lambda count: None)  # noqa: E731
-    return build_structure(images, rows, None, folder, silent)
+    return build_structure(images, rows, None, folder)
 
 
 def test_a_process_that_dies_is_named(tmp_path, monkeypatch):

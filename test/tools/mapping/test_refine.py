@@ -166,7 +166,7 @@ def test_step_and_covariances_are_those_of_the_dense_system():
 
 def fit(readout: float) -> tuple[RefinedMap, ShutterFit | None]:
     scene = walk(np.random.default_rng(1), VIDEO, points=100, count=40, readout=readout)
-    return fit_shutter(camera(0.0), scene.seen, scene.start, MapFreedom(), lambda text: None)
+    return fit_shutter(camera(0.0), scene.seen, scene.start, MapFreedom())
 
 
 def test_a_rolling_shutter_is_found():
@@ -188,7 +188,7 @@ def test_images_that_no_smooth_motion_joins_have_poses_of_their_own():
     scene = walk(np.random.default_rng(1), np.arange(0.0, 12.0, 1.0), readout=0.0)
     stamps = scene.seen.stamps_ns[0] + np.cumsum(np.tile([5, 50, 50], 4)) * 10**6
     seen = replace(scene.seen, stamps_ns=stamps)
-    refined, shutter = fit_shutter(camera(0.0), seen, scene.start, MapFreedom(), lambda text: None)
+    refined, shutter = fit_shutter(camera(0.0), seen, scene.start, MapFreedom())
     assert shutter is None
     assert refined.apart
     assert refined.fit_share > 0.95
