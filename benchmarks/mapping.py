@@ -261,7 +261,8 @@ def _survey(wall: bool, seeds: list[int]) -> _Errors:
     shape = _off(found, true, over, squares.mean(axis=0) - over @ ours.mean(axis=0))
     own = off[1:].ravel()
     squared = float(own @ np.linalg.solve(found.covariance[6:, 6:], own)) / len(own)
-    normalized = off[1:] / found.deviations[1:], shape / found.deviations_of_shape
+    spread = np.sqrt(np.diagonal(found.covariance)).reshape(-1, 6)[1:]
+    normalized = off[1:] / spread, shape / found.deviations_of_shape
     return _Errors((off[1:], shape), normalized, squared)
 
 

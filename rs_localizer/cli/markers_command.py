@@ -68,7 +68,7 @@ def run(options: Options) -> dict[str, object]:
     print(f"{map_file}: {len(marker_map.points)} corners in {marker_map.map_frame}")
     if len(pages) > 1:
         print("the markers do not fit on a page together: mount each where the map has it")
-    return {"pages": prints, "map": map_file, "corners": len(marker_map.points)}
+    return {"pages": [prints], "map": map_file, "corners": len(marker_map.points)}
 
 
 def _map(options: Options) -> MarkerMap:

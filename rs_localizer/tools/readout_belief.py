@@ -124,15 +124,11 @@ class ShutterFit:
     interval: float  # s, between the images
 
     @property
-    def possible(self) -> bool:
-        """True where a camera can read an image out so slowly."""
-        return self.readout_time < self.interval
-
-    @property
     def visible(self) -> bool:
         """True where the images show a rolling shutter."""
         significant = self.readout_time > _SIGNIFICANT * self.deviation
-        return significant and self.chance < _CHANCE and self.possible
+        possible = self.readout_time < self.interval  # no camera reads out for longer
+        return significant and self.chance < _CHANCE and possible
 
 
 # A time is another one if it differs from the given one by this many deviations, and by this (s).

@@ -13,11 +13,6 @@ from rs_localizer.core.scanning import REVERSED, ScanDirection
 from rs_localizer.tools.camera_calibration import CameraCalibration
 from rs_localizer.tools.rig_mounts import Mounted
 
-# Ninths of the image by row; one in which no keypoint lies is a guess of the lens.
-_REGIONS = (
-    "top left", "top", "top right", "left", "middle", "right", "bottom left", "bottom",
-    "bottom right",
-)  # fmt: skip
 # Corners that are bent by less (px, deviations) are those of a rectified film, or of a telephoto
 # lens.
 _STRAIGHT, _SIGMAS = 1.5, 4.0
@@ -73,12 +68,6 @@ def remarks(result: CameraCalibration) -> Iterator[str]:
             f"parts of the recording differ by more than their noise: the deviation is "
             f"{result.inflation:.1f} times that of the noise alone"
         )
-    observations = result.posed.observations
-    pixels = observations.pixels[observations.trusted]
-    cells = (3.0 * pixels / result.fit.camera.size).astype(int).clip(0, 2)
-    shown = {3 * row + column for column, row in cells.tolist()}
-    if empty := [name for place, name in enumerate(_REGIONS) if place not in shown]:
-        yield f"never showed the map: {', '.join(empty)} of the image; the lens is a guess there"
 
 
 def table(found: CameraCalibration, rate: float | None) -> Iterator[str]:

@@ -151,7 +151,5 @@ def _print_result(args: Options, built: Built, looked: Looked) -> None:
         )
     if built.readout_check is not None and built.readout_check.differs:
         print(f"warning: {built.readout_check.message}; the map has what was estimated")
-    if built.placement.doubt:
-        print(f"warning: {built.placement.doubt}")
     following = typed("replay", "IMAGES", "--map", str(args.out), "--out", "poses")
     print(f"next, for images of another walk: {following}")

@@ -22,8 +22,6 @@ from rs_localizer.tools.mapping.triangulation import Sights, Triangulated, trian
 
 # Corners of markers are where their map says to this part of their extent, or one of both is wrong.
 _MOST_MISFIT = 0.02
-# Corners that are further off than both, m and part of their extent, are off for a reason.
-_USUAL_MISFIT = 0.005, 0.002
 _LEAST_CORNERS = 4
 # Standard deviation (m) of corners in their map: prints are measured to within this.
 _DEVIATION = 0.001
@@ -78,7 +76,6 @@ class Placement:
     similarity: Similarity  # to metres
     scaled: bool
     basis: str
-    doubt: str = ""  # why it may be wrong
     up: str = "as the camera was held on average (a guess)"
 
 
@@ -148,13 +145,7 @@ def _by_markers(marker_map: MarkerMap, triangulated: Triangulated) -> Placement:
         )
     count, off = np.count_nonzero(determined), f"{1e3 * misfit:.1f} mm (rms)"
     basis = f"{count} corners of markers, within {off} of their map"
-    (metres, part), doubt = _USUAL_MISFIT, ""
-    if misfit > max(metres, part * extent):
-        doubt = (
-            f"the markers' corners are {1e3 * misfit:.1f} mm (rms) off their map, and so may be "
-            "the landmarks: check sizes and places in the marker map, and the readout time"
-        )
-    return Placement(similarity, True, basis, doubt, "as in the marker map")
+    return Placement(similarity, True, basis, "as in the marker map")
 
 
 # Observations that determine a corner.

@@ -365,5 +365,4 @@ def _shutter(built: Built) -> str:
     best = f"{1e3 * fit.readout_time:.2f} +- {1e3 * fit.deviation:.2f} ms, {fit.direction}"
     if fit.visible:
         return f"{best} (estimated)"
-    why = "" if fit.possible else f", longer than {1e3 * fit.interval:.1f} ms between images"
-    return f"invisible in these images (best fit {best}{why})"
+    return f"invisible in these images (best fit {best})"

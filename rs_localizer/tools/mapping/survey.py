@@ -159,11 +159,6 @@ class Survey:
     images: int  # that show markers of the map
 
     @property
-    def deviations(self) -> Array:
-        """Standard deviations (m,6) in the frame of the origin."""
-        return np.sqrt(np.diagonal(self.covariance)).reshape(-1, BODY)
-
-    @property
     def poor(self) -> BoolArray:
         """Which markers (m,) are known worse, beside the others, than a tenth of their size."""
         off = np.linalg.norm(self.deviations_of_shape[:, :PLACE], axis=1)

@@ -147,16 +147,11 @@ Frame = SimulatedFrame | RenderedFrame
 RIG_FRAME = "rig"
 
 
-def optical_frame(name: str) -> str:
-    """Return the frame of a camera of a rig."""
-    return f"{name}_optical_frame"
-
-
 def make_mounts(parts: RigParts) -> Any:
     """Return a tf2_msgs/TFMessage that says where the cameras are on the rig."""
     transforms = [
         make_transform(
-            make_message, 0, RIG_FRAME, optical_frame(name),
+            make_message, 0, RIG_FRAME, f"{name}_optical_frame",
             Transform(*parts.camera_from_rig[name]).inverse(),
         )
         for name in parts.cameras
@@ -247,6 +242,7 @@ def write_rig_frame(
     recorded_ns = frame.stamp_ns + round(camera.readout_time * 1e9)
     for time_ns in sorted({frame.stamp_ns, frame.middle_ns}):
         write_truth(bag, time_ns, motion.state(time_ns, np.zeros(1)), RIG_FRAME, recorded_ns)
-    messages = view_messages(camera, frame, stamp_ns, keypoints, optical_frame(image.name))
+    optical = f"{image.name}_optical_frame"
+    messages = view_messages(camera, frame, stamp_ns, keypoints, optical)
     for topic, message in messages.items():
         bag.write(f"/{image.name}{topic}", message, recorded_ns)

@@ -144,15 +144,6 @@ class Scene:
     marker_map: MarkerMap | None = None  # None: a scene without markers
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Box:
-    """The path of a camera in a frame whose diagonal x = y it mostly looks along; z is up."""
-
-    axes: Array  # (3,3) map_from_box
-    low: Array  # (3,)
-    high: Array  # (3,)
-
-
 def three_walls(path: TrueState) -> Scene:
     """Return two walls and a floor full of markers, in a corner before the camera.
 
@@ -161,10 +152,10 @@ def three_walls(path: TrueState) -> Scene:
     Args:
         path: of the camera, evenly in time, in a map whose z points up.
     """
-    box = _box(path, turned=0.25 * np.pi)
-    corner = np.array([*(box.high[:2] + _NEAR), box.low[2] - _BELOW])
-    extent = corner - (box.low - _OPEN)
-    height = box.high[2] + _ABOVE - corner[2]
+    axes, low, high = _box(path, turned=0.25 * np.pi)
+    corner = np.array([*(high[:2] + _NEAR), low[2] - _BELOW])
+    extent = corner - (low - _OPEN)
+    height = high[2] + _ABOVE - corner[2]
     # Larger markers where a long path would need more than there are.
     scale, most = 1.0, family(_FAMILY).count
     while True:
@@ -186,8 +177,8 @@ def three_walls(path: TrueState) -> Scene:
     markers: list[Marker] = []
     planes = []
     for (columns, rows, side, right, up, middle), light in zip(walls, _LIGHTS, strict=True):
-        frame = box.axes @ np.column_stack([right, up, np.cross(right, up)])
-        pose = Pose(box.axes @ middle, frame)
+        frame = axes @ np.column_stack([right, up, np.cross(right, up)])
+        pose = Pose(axes @ middle, frame)
         size = scale * side
         gap = _GAP * size
         made = wall(_FAMILY, (columns, rows), size, gap, first_id=len(markers), pose=pose)
@@ -198,8 +189,8 @@ def three_walls(path: TrueState) -> Scene:
 
 def room(path: TrueState) -> Scene:
     """Return a closed room around the path of the camera, every wall with its own picture."""
-    box = _box(path, turned=0.0)
-    low, high = box.low - _NEAR, box.high + _NEAR
+    axes, low, high = _box(path, turned=0.0)
+    low, high = low - _NEAR, high + _NEAR
     planes = []
     for axis in range(3):
         across, along = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
@@ -207,18 +198,21 @@ def room(path: TrueState) -> Scene:
         for side in range(2):
             start = low.copy()
             start[axis] = (low, high)[side][axis]
-            planes.append(_picture(box.axes, start, across, along, size, 2 * axis + side))
+            planes.append(_picture(axes, start, across, along, size, 2 * axis + side))
     return Scene(tuple(planes))
 
 
-def _box(path: TrueState, turned: float) -> _Box:
-    """Return the box of the path, in axes of its mean horizontal gaze, turned about z."""
+def _box(path: TrueState, turned: float) -> tuple[Array, Array, Array]:
+    """Return axes (3,3), low and high (3,) of the path, of its mean horizontal gaze.
+
+    The axes, map_from_box, are turned about z from the gaze; z is up.
+    """
     gaze = path.rotations[:, :2, 2].mean(axis=0)
     angle = float(np.arctan2(gaze[1], gaze[0])) - turned
     cosine, sine = np.cos(angle), np.sin(angle)
     axes = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
     seen_from = path.positions @ axes
-    return _Box(axes, seen_from.min(axis=0), seen_from.max(axis=0))
+    return axes, seen_from.min(axis=0), seen_from.max(axis=0)
 
 
 def _marker_plane(

@@ -15,7 +15,7 @@ from rs_localizer.io.bags import open_bag
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.ros.node.conversion import copy_message, make_message, message_class
-from rs_localizer.tools.simulation.simulated_recording import RIG_FRAME, optical_frame
+from rs_localizer.tools.simulation.simulated_recording import RIG_FRAME
 
 from ...pipeline.opposed_pair import PARTS, record  # noqa: TID252 - Python has a package "test"
 from ..conftest import TIMEOUT  # noqa: TID252
@@ -61,7 +61,7 @@ class Robot(around.Robot):
             self._static[-1].sendTransform(
                 make_transform(
                     lambda kind, **fields: message_class(kind)(**fields),
-                    0, RIG_FRAME, optical_frame(name), rig_from_camera,
+                    0, RIG_FRAME, f"{name}_optical_frame", rig_from_camera,
                 )
             )  # fmt: skip
 
