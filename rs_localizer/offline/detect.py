@@ -29,9 +29,6 @@ from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
 from rs_localizer.pipeline.marker_detector import FrameDetector, correspondences
 from rs_localizer.pipeline.refusal import Refusal
 
-# If none fits, this many images of another size than the calibration's are no stray ones.
-_MISFITS = 3
-
 
 @dataclass(slots=True)
 class ImageTally:
@@ -77,7 +74,7 @@ def record_markers(
         shots: the images, and what else of their recording is to be kept.
 
     Raises:
-        ValueError: when no image shows anything, or images and calibration differ in size.
+        ValueError: when no image shows anything.
     """
     found, others, faults = Extraction(), Counter[str](), Counter[str]()
     kept = _kept(shots, bag, found)
@@ -140,8 +137,7 @@ def usable(
         tally: of all images.
 
     Raises:
-        ValueError: when they and their calibration differ in size, or, without one, they are of
-            several sizes.
+        ValueError: when images without a calibration are of several sizes.
     """
     cameras, size = _Cameras(scan_direction), None
     for shot in shots:
@@ -174,14 +170,12 @@ class _Cameras:
     def __init__(self, scan_direction: str) -> None:
         self._scan_direction = scan_direction
         self._last: tuple[Calibration, Camera] | None = None
-        self._fits, self._misfits = False, 0  # whether an image has the calibration's size; others
 
     def camera_of(self, shot: Shot, image: Image) -> Camera | Refusal:
         """Return the camera of one image, or refuse it if its size is another one.
 
         Raises:
-            ValueError: when its camera_info cannot be used, or the first images are of another
-                size.
+            ValueError: when its camera_info cannot be used.
         """
         try:
             calibration = read_camera_info(shot.camera_info)
@@ -190,28 +184,14 @@ class _Cameras:
         except MessageError as error:
             raise ValueError(f"the camera_info cannot be used: {error}") from error
         camera = self._last[1]
-        (height, width), (across, down) = image.pixels.shape, camera.size
-        sizes = f"of {width}x{height}, the calibration is for {across}x{down}"
+        height, width = image.pixels.shape
         if (width, height) == camera.size:
-            self._fits = True
             return camera
-        self._misfits += 1
-        if self._misfits >= _MISFITS and not self._fits:
-            raise ValueError(f"the images are {sizes}{_why((width, height), camera.size)}")
-        text = f"the image at {1e-9 * image.stamp_ns:.3f} s is {sizes}"
-        return Refusal(Reason.BAD_IMAGE, text)
-
-
-def _why(size: tuple[int, int], calibrated: tuple[int, int]) -> str:
-    """Describe the relation of two sizes of images."""
-    if size == calibrated[::-1]:
-        return (
-            ": they are rotated by a quarter turn; calibrate with images as they are recorded (the "
-            "scan direction rotates with them)"
+        return Refusal(
+            Reason.BAD_IMAGE,
+            f"the image at {1e-9 * image.stamp_ns:.3f} s is of {width}x{height}, the calibration "
+            f"is for {camera.size[0]}x{camera.size[1]}: calibrate in the mode that is used",
         )
-    if abs(size[0] * calibrated[1] - size[1] * calibrated[0]) <= max(calibrated):
-        return ": another resolution of the same shape; calibrate in the mode that is used"
-    return ": another mode or camera; calibrate in the mode that is used"
 
 
 def _write(bag: BagWriter, shot: Shot, topic: str, message: Any, options: DetectionOptions) -> None:
@@ -230,7 +210,7 @@ def record_features(
     """Write the keypoints of all images that have any, each with its CameraInfo.
 
     Raises:
-        ValueError: when no image has keypoints, or images and calibration differ in size.
+        ValueError: when no image has keypoints.
     """
     extraction = Extraction()
     kept = _kept(shots, bag, extraction)

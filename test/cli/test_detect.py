@@ -227,8 +227,7 @@ def test_images_of_another_size_are_left_out_or_named(here, first, last, code, c
     assert detect(here, images, *here.calibration, *here.board, "--rate", "10") == code
     said = capsys.readouterr()
     if code:
-        fault = "the images are of 160x120, the calibration is for 320x240: another resolution"
-        assert fault in said.err
+        assert "is of 160x120, the calibration is for 320x240" in said.err
         return
     assert "11 of 12 images" in said.out
     assert re.search(r"left out, .* because the image at [\d.]+ s is of 160x120", said.out)
