@@ -24,7 +24,7 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.io.reading import dump_yaml, file_faults, load_yaml, read_text
 from rs_localizer.markers import prints
-from rs_localizer.markers.families import FAMILIES, Family, family
+from rs_localizer.markers.families import FAMILIES, family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 
 USUAL_FAMILY = FAMILIES["apriltag_36h11"]
@@ -55,12 +55,8 @@ def read_marker_map(path: Path | str) -> MarkerMap:
     return read_any(Path(path))[0]
 
 
-def read_any(path: Path, kind: Family | None = None) -> tuple[MarkerMap, str]:
-    """Read a marker map of any format; return it with the name of the format.
-
-    Args:
-        kind: of the markers of apriltag_ros; None: as the file says, or the usual one.
-    """
+def read_any(path: Path) -> tuple[MarkerMap, str]:
+    """Read a marker map of any format; return it with the name of the format."""
     with file_faults(path, MarkerMapError, "YAML or JSON"):
         tree = load_yaml(read_text(path))
     try:
@@ -72,7 +68,7 @@ def read_any(path: Path, kind: Family | None = None) -> tuple[MarkerMap, str]:
             file.finish()
             return MarkerMap(tuple(markers), tuple(boards), frame), OWN
         if "tag_bundles" in file or "standalone_tags" in file:
-            kind = kind or family(file.value(_TAG_FAMILY, str, USUAL_FAMILY.name))
+            kind = family(file.value(_TAG_FAMILY, str, USUAL_FAMILY.name))
             return MarkerMap(tuple(_bundle(file, kind.name))), _BUNDLES
         if "target_type" in file:
             return _aprilgrid(file), _KALIBR

@@ -12,7 +12,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.markers.boards import flat_misfit
-from rs_localizer.markers.families import FAMILIES, family
+from rs_localizer.markers.families import family
 from rs_localizer.markers.map_files import read_any, read_marker_map, write_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError, wall
 from rs_localizer.markers.prints import Charuco, Chessboard, Marker, Pose
@@ -175,12 +175,10 @@ def test_bundles_of_apriltag_ros(tmp_path):
         read_any(as_file(tmp_path, two))
 
 
-def test_what_the_user_says_of_the_family_goes_first(tmp_path):
+def test_the_family_of_a_bundle_is_that_of_its_file(tmp_path):
     named = BUNDLE + "tag_family: tag25h9\n"
     (first, _) = read_any(as_file(tmp_path, named))[0].markers
     assert first.family.name == "apriltag_25h9"
-    said, _ = read_any(as_file(tmp_path, named), FAMILIES["5x5_100"])
-    assert said.markers[0].family.name == "5x5_100"
     with pytest.raises(MarkerMapError, match="unknown family 'tag9h9'"):
         read_any(as_file(tmp_path, named.replace("tag25h9", "tag9h9")))
 

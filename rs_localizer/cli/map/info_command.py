@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from rs_localizer.cli.options import UsageError, argument, option
+from rs_localizer.cli.options import argument
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.recording import MAP_FRAME
-from rs_localizer.markers.families import family
-from rs_localizer.markers.map_files import FORMATS, USUAL_FAMILY, is_marker_file, read_any
+from rs_localizer.markers.map_files import FORMATS, is_marker_file, read_any
 from rs_localizer.markers.maps import MarkerMap
 
 Figures = dict[str, Any]
@@ -30,9 +29,6 @@ class Options:
         "landmarks: a .npz file or a folder of COLMAP; markers: a .yaml or .json file of "
         f"{', '.join(FORMATS)}", "FILE",
     )  # fmt: skip
-    family: str | None = option(
-        f"of tags of apriltag_ros (default: that of the file, or {USUAL_FAMILY.name})", "NAME"
-    )
 
 
 def run(options: Options) -> Figures:
@@ -45,11 +41,7 @@ def read(options: Options) -> tuple[Map | MarkerMap, str]:
     if not is_marker_file(options.file):
         # Frames are the localizer's business: files of landmarks do not name one.
         return read_map_file(options.file, MAP_FRAME), "landmarks"
-    try:
-        kind = None if options.family is None else family(options.family)
-    except ValueError as error:
-        raise UsageError(f"--family: {error}") from error
-    return read_any(options.file, kind)
+    return read_any(options.file)
 
 
 def describe(file: Path, any_map: Map | MarkerMap, kind: str) -> Figures:
