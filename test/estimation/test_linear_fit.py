@@ -134,15 +134,15 @@ def test_vibration_is_integrated_as_over_dense_matrices():
     freedom, noise = 62.0, 0.5
     white = dense.T @ dense / noise**2 + information
     first = -np.linalg.solve(white, dense.T @ errors / noise**2 + slope)
-    bands = np.array([1.3, 3.3, 1.0, 2.0, 3.0, 5.0])[:, None]
+    bands = np.array([1.0, 2.0, 3.0, 5.0, 1.3, 3.3])[:, None]
     near = np.exp(-0.5 * (np.log(CYCLES / bands) / 0.35) ** 2) + 0.1
     near *= np.sqrt(np.sum(TYPICAL_SIZES**2) / np.sum(near**2, axis=1, keepdims=True))
-    axes = [np.array([0.1, 0.1, 1.0])] * 2 + [np.ones(3)] * 5  # the first: about the optical axis
-    shapes = zip((*near, TYPICAL_SIZES), axes, strict=True)
+    axes = [np.ones(3)] * 5 + [np.array([0.1, 0.1, 1.0])] * 2  # the last: about the optical axis
+    shapes = zip((TYPICAL_SIZES, *near), axes, strict=True)
     sizes_of = [np.outer(np.repeat(of, 2), axis).ravel() for of, axis in shapes]
     every = [factor * sizes for sizes in sizes_of for factor in FACTORS]
     prior = np.tile(-0.5 * (np.log(FACTORS) / np.log(10.0)) ** 2, 7)
-    prior[: 2 * len(FACTORS)] -= 4.0
+    prior[-2 * len(FACTORS) :] -= 4.0
     prior -= logsumexp(prior)
     rest = errors @ errors / noise**2 + prior_cost + first @ (dense.T @ errors / noise**2 + slope)
     for sizes, before in zip(every, prior, strict=True):
