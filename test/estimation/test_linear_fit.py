@@ -178,6 +178,28 @@ def test_vibration_is_integrated_as_over_dense_matrices():
     alike(hiding, shown[:12, :12], np.sqrt(np.diag(poses)), atol=1e-6)
 
 
+def test_no_size_that_a_large_vibration_shows_is_left_out():
+    """Small sizes of its frequency explain less than another spectrum does."""
+    truth, lines, _, _ = shaking()
+    (turns, _), known, shared = whole_waves(lines), known_at(PRIOR, truth), nothing_shared(40)
+    of_cycles = np.exp(-0.5 * (np.log(CYCLES / 5.0) / 0.2) ** 2)
+    wave = np.outer(np.repeat(of_cycles, 2), [1.0, 1.0, 0.0]).ravel()
+    wave *= np.random.default_rng(1).normal(size=84)
+    wave *= 128.0 * np.linalg.norm(TYPICAL_SIZES) / np.linalg.norm(wave)
+    far = lines._replace(errors=lines.errors + (turns @ wave).reshape(40, 2))
+    linear = linear_of(far, np.ones(40, bool), True, shared)
+
+    def fitted(odds):
+        prior = VIBRATION._replace(odds=odds)
+        return fit(linear, shared, known, Noise(0.5, 1.0, 18.0), prior, True)
+
+    count = len(VIBRATION.odds)
+    alone = [fitted(np.where(np.arange(count) == k, 0.0, -np.inf)).gain for k in range(count)]
+    logs = VIBRATION.odds + alone
+    expected = np.exp(logs - logsumexp(logs))
+    np.testing.assert_allclose(fitted(VIBRATION.odds).weights, expected, atol=0.01)
+
+
 @pytest.mark.parametrize("name", ["turn", "shared"])
 def test_a_block_that_is_dropped_by_name_leaves_the_fit_without_it(name):
     truth, chosen, lines, shared, _ = everything(False)
