@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure
 from rs_localizer.core.state import (
@@ -33,6 +33,7 @@ from rs_localizer.estimation.gaussian import along_arcs
 from rs_localizer.estimation.hypotheses import Posterior
 from rs_localizer.estimation.known_rotation import with_turn
 from rs_localizer.estimation.points import Observed, Usable
+from rs_localizer.native import entry
 
 # Errors as large as the gate lets them be are those of points strewn over it.
 # A global shutter leaves errors of the motion beside the noise. In inlier thresholds.
@@ -94,9 +95,7 @@ def refusal(
             f"{found} inliers do not determine the motion: smallest eigenvalue of the scaled "
             f"information {posterior.smallest_eigenvalue:.1e}",
         )
-    turn = rotation_of(posterior.state)  # none, where points on a line let it run away
-    finite = np.isfinite(posterior.state).all() and np.isfinite(posterior.covariance).all()
-    if not (finite and np.abs(turn @ turn.T - np.eye(3)).max() < _ROUNDED):
+    if not _is_motion(posterior.state, posterior.covariance):
         return Failure(
             Reason.DEGENERATE,
             f"{found} inliers leave the motion so open that it cannot be computed",
@@ -109,6 +108,14 @@ def refusal(
             "too small for the noise; set map_deviation, if points of the map are that far off",
         )
     return None
+
+
+@entry
+def _is_motion(state: Array1, covariance: Array2) -> bool:
+    """Return whether both are finite, and the rotation is one: points on a line let it run away."""
+    turn = state[:9].copy().reshape(3, 3)
+    off = np.max(np.abs(turn @ turn.T - np.eye(3)))
+    return bool(np.all(np.isfinite(state)) and np.all(np.isfinite(covariance)) and off < _ROUNDED)
 
 
 def too_few(inliers: BoolArray, squared_errors: Array, samples: int, needed: int) -> Failure:
@@ -146,7 +153,7 @@ def uncertain(estimate: Estimate) -> Failure | None:
     """
     still, most = estimate.still_deviation, MOST_TURN
     turn = (estimate.covariance - estimate.moved_covariance)[TURN, TURN]
-    if np.trace(turn) <= most**2:  # less than that about any axis
+    if turn.trace() <= most**2:  # less than that about any axis
         return None
     deviation = math.sqrt(np.linalg.eigvalsh(turn)[-1])
     if deviation <= most or (still <= most and deviation <= _OPEN * most):

@@ -21,8 +21,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from rs_localizer.config import CalibrationErrors
-from rs_localizer.core.arrays import Array, Array1, Array2
+from rs_localizer.core.arrays import Array, Array1, Array2, Array3
 from rs_localizer.core.bearings import pinhole, projected_by
+from rs_localizer.core.blocks import write
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import by_lens, coefficients_of, corner_of
 from rs_localizer.core.shake import shake_at
@@ -151,12 +152,11 @@ def calibration_effect(
     bend = posterior.bend[chosen] if posterior.bend.shape[1] else np.zeros((len(rays), 0))
     of_speeds = posterior.speeds if len(posterior.speeds) else _CONFIGURED
     lens = some.lens_of(exposure.lenses)
-    smooth = posterior.shared * smooth_columns_of(by_motion, image, bend, lens)
-    rows = np.concatenate([smooth, by_motion, columns], axis=2).reshape(2 * len(rays), -1)
+    smooth = smooth_columns_of(by_motion, image, bend, lens)
     # Without other frames the covariance has all of what the smooth error does.
     covariance, left, still = _effect(
-        rows, found / len(rays), (smooth.shape[2], tracked), of_speeds, terms, state,
-        posterior.noise**2, rotation is not None,
+        smooth, by_motion, columns, (posterior.shared, found / len(rays), tracked), of_speeds,
+        terms, state, posterior.noise**2, rotation is not None,
     )  # fmt: skip
     still *= math.sqrt(posterior.inflation)
     if not (np.isfinite(covariance).all() and np.isfinite(left).all()):
@@ -167,24 +167,34 @@ def calibration_effect(
 
 @entry
 def _effect(
-    rows: Array2, weight: float, fitted: tuple[int, bool], of_speeds: Array1, terms: PriorTerms,
-    state: Array1, variance: float, turn_known: bool,
+    by_smooth: Array3, by_motion: Array3, by_errors: Array3, given: tuple[float, float, bool],
+    of_speeds: Array1, terms: PriorTerms, state: Array1, variance: float, turn_known: bool,
 ) -> tuple[Array, Array, float]:  # fmt: skip
     """Return what errors of one deviation do to pose and velocities, and what they leave.
 
     Args:
-        rows: (2n,q+18+k) columns of smooth error, motion, and errors.
-        weight: of their products, for points that are left out.
-        fitted: how many columns the smooth error has; and whether it does something beside the
-            covariance, too.
+        by_smooth, by_motion, by_errors: (n,2,q), (n,2,18), (n,2,k) px.
+        given: size of the smooth error (px); weight of products, for points that are left out; and
+            whether the smooth error does something beside the covariance, too.
         of_speeds: probabilities of typical speeds.
 
     Returns:
         covariance (12,12) and what no motion takes up (k,), px^2, NaN: nothing is determined; and
         the deviation (rad) of the orientation about the axis known worst if the motion were known.
     """
-    (smooth, is_beside), every, still = fitted, weight * (rows.T @ rows), np.inf
-    size, last = len(every), smooth + PARAMETERS
+    (shared, weight, is_beside), smooth, still = given, by_smooth.shape[2], np.inf
+    last = smooth + PARAMETERS
+    size = last + by_errors.shape[2]
+    rows = np.empty((len(by_motion), 2, size))
+    for i in range(len(rows)):
+        for side in range(2):
+            row = rows[i, side]
+            for k in range(smooth):
+                row[k] = shared * by_smooth[i, side, k]
+            write(row[smooth:last], by_motion[i, side])
+            write(row[last:], by_errors[i, side])
+    flat = rows.reshape(-1, size)
+    every = weight * (flat.T @ flat)
     of_pose = inverted(every[smooth : smooth + POSE.stop, smooth : smooth + POSE.stop].copy())
     if np.isfinite(of_pose[0, 0]):
         still = math.sqrt(variance) * longest_axis(of_pose[TURN, TURN].copy())

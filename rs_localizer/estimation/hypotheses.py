@@ -443,7 +443,7 @@ def _clearly_moving(given: _Given) -> bool:
     known = given.assumed.turn is not None  # and only the way is not
     place = slice(LINEAR.start if known else VELOCITIES.start, VELOCITIES.stop)
     spread = given.best.covariance[place, place]
-    part = float(np.diagonal(given.terms.informations[0])[place] @ np.diagonal(spread))
+    part = float(given.terms.informations[0].diagonal()[place] @ spread.diagonal())
     velocities = given.best.state[POSE_SIZE - POSE.stop :][place]
     far = velocities @ solve_positive(spread.copy(), velocities)[0]
     return part < _LITTLE_OF_THE_PRIOR and bool(far > _CLEARLY_MOVING)

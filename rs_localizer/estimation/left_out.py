@@ -10,7 +10,6 @@ way round; and one motion of all of them before a camera with another matrix tha
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from itertools import product
 from typing import NamedTuple
 
@@ -27,7 +26,7 @@ from rs_localizer.core.state import (
     TURN,
     step_between,
 )
-from rs_localizer.core.types import Failure
+from rs_localizer.core.types import Failure, altered
 from rs_localizer.estimation.acceptance import speeding
 from rs_localizer.estimation.calibration import promised
 from rs_localizer.estimation.hypotheses import Posterior
@@ -209,7 +208,7 @@ def reordered(search: MotionSearch, observed: Observed, threshold: float) -> Fai
     seen, usable = observed.observations, observed.usable.indices
     for order in _ORDERS if _markers(observed) else ():
         by = np.arange(len(usable)).reshape(-1, 4)[:, order].ravel()
-        part = replace(observed, ranking=observed.ranking[:0], observations=Observations.of(
+        part = altered(observed, ranking=observed.ranking[:0], observations=Observations.of(
             seen.points, seen.rays[by], seen.tau[by], seen.by_ray[by], seen.mounts, seen.camera[by]
         ))  # fmt: skip
         fit = search.from_rough(part, search.rough(part))
@@ -262,8 +261,8 @@ def _own_motion(
     """Return the motion that more left-out points share than chance makes, or None."""
     observations, gate = observed.observations, WIDEST_GATE * threshold
     left, area = int(np.count_nonzero(rest)), _area(observed)
-    some = np.flatnonzero(rest)[:: 1 + left // _MANY]
-    part = replace(observed, observations=observations.only(some), ranking=observed.ranking[:0])
+    some = np.flatnonzero(rest)[:: 1 + left // _MANY].copy()
+    part = altered(observed, observations=observations.only(some), ranking=observed.ranking[:0])
     start, circle = search.rough(part), GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length
     near = int(np.count_nonzero(part.observations.within(start.state, circle)))
     if _surprise(len(some), near, _OF_POSE, math.pi * circle**2 / area) < _LEAST_CHANCE:
@@ -401,7 +400,7 @@ def _through(observed: Observed, lens: Array) -> Observed:
     seen, usable = observed.observations, observed.usable
     by_ray = lens[0] * usable.by_ray[usable.indices]
     rays = (seen.rays - lens[1:]) / lens[0]
-    return replace(observed, observations=Observations.of(
+    return altered(observed, observations=Observations.of(
         seen.points, rays, seen.tau, by_ray, seen.mounts, seen.camera
     ))  # fmt: skip
 
@@ -451,7 +450,8 @@ def by_chance(observed: Observed, posterior: Posterior, threshold: float) -> Fai
     errors = posterior.squared_errors
     inliers = posterior.inliers & np.isfinite(errors)  # a gate may be as wide as a motion is absurd
     found = int(np.count_nonzero(inliers))
-    gate = float(errors[inliers].max(initial=0.0))
+    fitting = errors[inliers]
+    gate = float(fitting.max()) if found else 0.0
     # Of a rough map, or a short focal length, the gate may be as wide: others need room beside it.
     circle = max((GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length) ** 2, 4.0 * gate)
     near = int(np.count_nonzero(errors <= circle))
@@ -461,7 +461,7 @@ def by_chance(observed: Observed, posterior: Posterior, threshold: float) -> Fai
     elif near <= found + _MARKER:
         return None
     # One point may fill the gate, as a near one does of a rough map: so many others fit better.
-    best, sizes = np.sort(errors[inliers]), (found, 3 * found // 4, found // 2)
+    best, sizes = np.sort(fitting), (found, 3 * found // 4, found // 2)
     chances, sample = best / area, PARAMETERS // 2
     surprises = [_surprise(total, k, sample, float(chances[k - 1])) for k in sizes if k]
     if max(surprises, default=0.0) > _LEAST_CHANCE:

@@ -154,18 +154,18 @@ class TurnPrior(NamedTuple):
 
 
 def _vibration() -> TurnPrior:
-    """Return each size of vibration about each of some frequencies, then of an ordinary one."""
+    """Return each size of an ordinary vibration, then of one about each of some frequencies."""
     alike, roll = np.ones(3), np.array([_ACROSS, _ACROSS, 1.0])
     shapes = []
-    for cycles, axes in (*((each, roll) for each in _ROLLS), *((each, alike) for each in _BANDS)):
+    for cycles, axes in (*((each, alike) for each in _BANDS), *((each, roll) for each in _ROLLS)):
         sizes = np.exp(-0.5 * (np.log(CYCLES / cycles) / _WIDTH) ** 2) + _FLOOR
         sizes *= math.sqrt(float((TYPICAL_SIZES**2).sum() / (sizes**2).sum()))
         inverse = np.linalg.inv(IN_COMBINATIONS * np.repeat(sizes, 2) ** 2 @ IN_COMBINATIONS.T)
         shapes.append(np.kron(inverse, np.diag(axes**-2.0)))
-    shapes.append(np.eye(TURNS))
+    shapes.insert(0, np.eye(TURNS))  # the likeliest first, so that others are soon out of question
     informations = np.array(shapes)[:, None] / FACTORS[:, None, None] ** 2
     odds = np.tile(-0.5 * (np.log(FACTORS) / _DECADE) ** 2, (len(shapes), 1))
-    odds[: len(_ROLLS)] -= _RARE  # first, as odds that sink mean a larger size of one spectrum
+    odds[-len(_ROLLS) :] -= _RARE
     return TurnPrior.of(informations.reshape(-1, TURNS, TURNS), odds.ravel())
 
 
@@ -592,20 +592,13 @@ def _over_turns(
     moments = np.empty((count if combines else 0, told, told))
     weights, left = np.full(count, -np.inf), np.ones(count)
     rest, best, covariance = equations[size, size], -np.inf, np.zeros((told, told))
+    gain = fall = 0.0
     if np.all(np.isfinite(equations)):
-        # What a turn of any size explains.
-        wholes[0] = equations[:size]
-        eliminate(wholes[0], size)
-        free, volume = max(1.0 - np.sum(wholes[0, :, size] ** 2) / rest, _LEAST_LEFT), 0.0
-        noisy = scale * rest / freedom  # if there is no turn
-        is_hopeless = False
         for k in range(count):
-            is_less = k > 0 and prior.odds[k] < prior.odds[k - 1]
-            if not is_less:
-                is_hopeless = False  # another spectrum
-            most = prior.odds[k] + volume - 0.5 * freedom * math.log(free) + noisy * (1.0 - free)
-            if is_hopeless or (is_less and most < best - _HOPELESS):
-                is_hopeless = True
+            if k == 0 or prior.volumes[k] > prior.volumes[k - 1]:
+                gain = fall = 0.0  # another spectrum, of which the smallest size is next to none
+            # Evidence that falls from one size to the next falls no less to the one after it.
+            if fall < 0.0 and prior.odds[k] + gain + fall < best - _HOPELESS:
                 continue
             if prior.odds[k] == -np.inf:
                 continue
@@ -616,19 +609,19 @@ def _over_turns(
                     row[j] = own[j] + more[j]
                 write(whole[i, size:], equations[i, size:])
             eliminate(whole, size)
-            half, volume = whole[:, size:].copy(), prior.volumes[k]
-            both = half.T @ half
+            before, gain = gain, prior.volumes[k]
+            for i in range(size):
+                gain -= math.log(whole[i, i])
+            left[k] = max(1.0 - np.sum(whole[:, size] ** 2) / rest, _LEAST_LEFT)
+            gain += scale * rest / freedom * (1.0 - left[k]) - 0.5 * freedom * math.log(left[k])
+            weights[k], fall = prior.odds[k] + gain, gain - before
+            best = max(best, weights[k])
             if combines:
+                half = whole[:, size:].copy()
+                both = half.T @ half
                 means[k], moments[k] = both[0, 1:], both[1:, 1:]
             else:
                 back(whole, means[k])
-            for i in range(size):
-                volume -= math.log(whole[i, i])
-            left[k] = max(1.0 - both[0, 0] / rest, _LEAST_LEFT)
-            weights[k] = prior.odds[k] + volume - 0.5 * freedom * math.log(left[k])
-            weights[k] += noisy * (1.0 - left[k])
-            best = max(best, weights[k])
-            is_hopeless = is_less and weights[k] < best - _HOPELESS
     if not best > -np.inf:
         return np.zeros(told), covariance, -np.inf, 1.0, weights
     weights = np.exp(weights - best)

@@ -101,7 +101,7 @@ def checked(
             raise ValueError(f"scores must be ({n},), got {scores.shape}")
         checks.append(("scores", scores))
     for name, array in checks:
-        if not np.all(np.isfinite(array)):
+        if not np.isfinite(array).all():
             raise ValueError(f"{name} must be finite, found NaN or infinity")
     return points, pixels, scores
 
@@ -168,6 +168,17 @@ def pack(
     return data
 
 
+@entry
+def picked(
+    points: Array2, rays: Array2, tau: Array1, by_ray: Array3, camera: IntArray1, mounts: Mounts,
+    chosen: IntArray1, origin: Array1,
+) -> tuple[Array, Array, Array, Array, IntArray, Array]:  # fmt: skip
+    """Return what `pack` takes of chosen points (m,), relative to an origin (3,), and packed."""
+    places, own, rows = points[chosen] - origin, rays[chosen], tau[chosen]
+    slopes, sides = by_ray[chosen], camera[chosen]
+    return places, own, rows, slopes, sides, pack(places, own, rows, slopes, sides, mounts)
+
+
 @kernel
 def weighted(data: Array, weights: Array | BoolArray) -> Array:
     """Return the packed points with these weights (n,): 1 or 0."""
@@ -186,8 +197,8 @@ class Observations:
     tau: Array  # (n,)
     by_ray: Array  # (n,2,2) derivatives of the pixels
     camera: IntArray  # (n,) which of the mounted sides sees each
-    mounts: Mounts
     packed: Array
+    mounts: Mounts
 
     @classmethod
     def of(
@@ -198,14 +209,14 @@ class Observations:
         if camera is None:
             camera = np.zeros(len(points), np.int64)
         packed = pack(points, rays, tau, by_ray, camera, mounts)
-        return cls(points, rays, tau, by_ray, camera, mounts, packed)
+        return cls(points, rays, tau, by_ray, camera, packed, mounts)
 
     def only(self, chosen: IntArray) -> Observations:
         """Return the observations of these points."""
-        return Observations.of(
-            self.points[chosen], self.rays[chosen], self.tau[chosen], self.by_ray[chosen],
-            self.mounts, self.camera[chosen],
-        )  # fmt: skip
+        return Observations(*picked(
+            self.points, self.rays, self.tau, self.by_ray, self.camera, self.mounts, chosen,
+            np.zeros(3),
+        ), self.mounts)  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.points)
@@ -374,11 +385,10 @@ class FrameSights(NamedTuple):
 
 def packed(exposure: Exposure, points: Array, usable: Usable) -> Observations:
     """Pack the usable points (of these (n,3)), relative to their median."""
-    kept = usable.indices
-    return Observations.of(
-        points[kept] - usable.centre, usable.rays[kept], usable.tau[kept], usable.by_ray[kept],
-        exposure.mounts, usable.camera[kept],
-    )  # fmt: skip
+    return Observations(*picked(
+        points, usable.rays, usable.tau, usable.by_ray, usable.camera, exposure.mounts,
+        usable.indices, usable.centre,
+    ), exposure.mounts)  # fmt: skip
 
 
 # Points whose depth relief is a smaller part than this of their narrower extent are a plane.

@@ -30,7 +30,7 @@ from rs_localizer.core.arrays import (
 from rs_localizer.core.blocks import write
 from rs_localizer.core.rig import Mounts
 from rs_localizer.core.state import STATE_SIZE, rotation_of
-from rs_localizer.estimation.points import Observations, Observed, leaning_less
+from rs_localizer.estimation.points import Observations, Observed, leaning_less, plane_of
 from rs_localizer.estimation.prior import PriorTerms, held_terms
 from rs_localizer.estimation.projection import truncated_cost
 from rs_localizer.estimation.robust import EXPECTED_NOISE, anneal, refine
@@ -59,20 +59,19 @@ class Pool(NamedTuple):
     """
 
     points: IntArray1  # (n,)
-    row_range: float  # of the row times of its camera's points
     share: float  # of the samples
     # (k,) samples that lie in the first points, from a sample's size on; (0,): all are alike
     growth: Array1
 
     @classmethod
-    def of(cls, points: IntArray, row_range: float, share: float, ranked: int) -> Pool:
+    def of(cls, points: IntArray, share: float, ranked: int) -> Pool:
         """Return a pool, ``ranked`` for samples of this size; 0: not at all."""
         total, growth = len(points), np.zeros(0)
         if ranked:
             k = np.arange(ranked)
             first = np.arange(ranked, total)[:, None]
             growth = _RANKED_HORIZON * np.prod((first - k) / (total - k), axis=1)
-        return cls(points, row_range, share, growth)
+        return cls(points, share, growth)
 
 
 def pools_of(
@@ -94,14 +93,12 @@ def pools_of(
         groups.insert(0, (ranking if also_all else ranking[among[ranking]], size))
     if also_all:
         groups.insert(0, (chosen, 0))
-    for place in range(len(observations.mounts.axes)):
-        here = observations.camera == place
-        tau = observations.tau[here]
-        row_range = float(tau.max() - tau.min()) if len(tau) else 0.0
+    count = len(observations.mounts.axes)
+    for place in range(count):
         for points, ranked in groups:
-            own = points[here[points]]
+            own = points[observations.camera[points] == place] if count > 1 else points
             if len(own) >= size:
-                pools.append(Pool.of(own, row_range, len(own) / len(points), ranked))
+                pools.append(Pool.of(own, len(own) / len(points), ranked))
     return pools
 
 
@@ -116,14 +113,22 @@ def _next(random: Any) -> Any:
 
 
 @entry
-def draw(pool: Pool, drawn: int, tau: Array1, random: Random, samples: Out[IntArray2]) -> None:
+def draw(
+    pool: Pool, drawn: int, tau: Array1, camera: IntArray1, random: Random, samples: Out[IntArray2]
+) -> None:  # fmt: skip
     """Fill ``samples`` (h,n) with distinct points of the pool, row by row.
 
     Args:
         drawn: samples before these.
+        tau, camera: (n,) row times of all points, and which side sees each.
     """
     count, size = samples.shape
     points = pool.points
+    latest, earliest = -np.inf, np.inf  # of the camera's points
+    for i in range(len(tau)):
+        if camera[i] == camera[points[0]]:
+            latest, earliest = max(latest, tau[i]), min(earliest, tau[i])
+    least = _LEAST_ROW_SPREAD * (latest - earliest)
     for h in range(count):
         among = int(np.searchsorted(pool.growth, drawn + h + 1.0))
         among += len(points) - len(pool.growth)
@@ -143,7 +148,7 @@ def draw(pool: Pool, drawn: int, tau: Array1, random: Random, samples: Out[IntAr
                 samples[h, i] = point
                 first = min(first, tau[point])
                 last = max(last, tau[point])
-            if last - first >= _LEAST_ROW_SPREAD * pool.row_range:
+            if last - first >= least:
                 break
 
 
@@ -272,6 +277,7 @@ def search(
     """
     observations, solver = observed.observations, hypotheses.solver
     mounts, data = observations.mounts, observations.packed
+    tau, sides = observations.tau, observations.camera
     score, final, noise = hypotheses.score_scale, hypotheses.final_scale, hypotheses.noise
     best, inlier_ratios, drawn = start, None, [0] * len(pools)
     rotations, shares = mounts.axes @ rotation, [*accumulate(pool.share for pool in pools)]
@@ -281,12 +287,12 @@ def search(
         samples = np.empty((min(hypotheses.block, left), solver.sample_size), np.int64)
         ends = [int(share / shares[-1] * len(samples)) for share in shares]
         for k, (first, last) in enumerate(pairwise([0, *ends])):
-            draw(pools[k], drawn[k], observations.tau, observed.random, samples[first:last])
+            draw(pools[k], drawn[k], tau, sides, observed.random, samples[first:last])
             drawn[k] += last - first
         models = np.empty((solver.solutions, MODEL_SIZE, len(samples)))
-        camera = observations.camera[samples[:, 0]]
+        camera = sides[samples[:, 0]]
         solver.solve(
-            observations.points, observations.rays, observations.tau, samples, rotations[camera],
+            observations.points, observations.rays, tau, samples, rotations[camera],
             hypotheses.iterations, models,
         )  # fmt: skip
         states, costs = best_models(models, camera, mounts, data, score, bar)
@@ -295,11 +301,11 @@ def search(
             found = Candidate(*optimize(states, costs, data, 2.0 * score, final, prior, noise))
         if found.cost < best.cost:
             best, inlier_ratios = found, None
-        if inlier_ratios is None and best.found:
-            near = observations.within(best.state, final)
-            inlier_ratios = [near[each.points].sum() / len(each.points) for each in pools]
-        bar = min(bar, float(costs[0]))
         left = hypotheses.most - sum(drawn)
+        if inlier_ratios is None and best.found and left > 0:
+            near = observations.within(best.state, final)
+            inlier_ratios = [np.count_nonzero(near[it.points]) / len(it.points) for it in pools]
+        bar = min(bar, float(costs[0]))
         if inlier_ratios is not None:  # the chance that no sample held inliers alone
             each = zip(inlier_ratios, drawn, strict=True)
             missed = math.prod((1.0 - ratio**solver.sample_size) ** count for ratio, count in each)
@@ -321,8 +327,10 @@ _BLOCK = 64
 # A start, or a motion of left-out points, draws at most so many: of a fast camera one pose explains
 # so few points that the search would not end, and 70 to 80 % of outliers need no more (239 frames).
 _FEW_SAMPLES = 384
-# A start leads nowhere if its own motion fits less than this part of the points near it.
-_AGREEING = 0.5
+# A start leads nowhere if its own motion fits less than this part of the points near it; and if it
+# fits this one, samples lead to no other motion (ten frames each of all conditions that are timed),
+# unless the points lie on a plane, which may lean otherwise.
+_AGREEING, _SURELY = 0.5, 0.9
 
 
 class MotionSearch:
@@ -386,11 +394,13 @@ class MotionSearch:
             # The global-shutter pose is a hypothesis, too: at rest it is the best one.
             first = self.optimize(observed, start.state, self._near, observed.terms)
             agreeing = near & observations.within(first.state, self._config.inlier_threshold)
-            leads_on = np.count_nonzero(agreeing) >= _AGREEING * np.count_nonzero(near)
+            share = np.count_nonzero(agreeing) / max(int(np.count_nonzero(near)), 1)
+            if share >= _SURELY and not plane_of(observations.points, near)[0]:
+                return first._replace(samples=start.samples)
             # Turning and moving stretch and shear the image of a plane that faces the camera, so
             # that the pose leans by tens of degrees. From there the way leads to other leans, and
             # samples of six noisy points tell leaning from moving no better.
-            if not leads_on:
+            if share < _AGREEING:
                 leans, towards = leaning_less(observations.points, near, start.state, 1.0)
                 if leans:
                     other = self.optimize(observed, towards, self._near, observed.terms)

@@ -134,15 +134,15 @@ def test_vibration_is_integrated_as_over_dense_matrices():
     freedom, noise = 62.0, 0.5
     white = dense.T @ dense / noise**2 + information
     first = -np.linalg.solve(white, dense.T @ errors / noise**2 + slope)
-    bands = np.array([1.3, 3.3, 1.0, 2.0, 3.0, 5.0])[:, None]
+    bands = np.array([1.0, 2.0, 3.0, 5.0, 1.3, 3.3])[:, None]
     near = np.exp(-0.5 * (np.log(CYCLES / bands) / 0.35) ** 2) + 0.1
     near *= np.sqrt(np.sum(TYPICAL_SIZES**2) / np.sum(near**2, axis=1, keepdims=True))
-    axes = [np.array([0.1, 0.1, 1.0])] * 2 + [np.ones(3)] * 5  # the first: about the optical axis
-    shapes = zip((*near, TYPICAL_SIZES), axes, strict=True)
+    axes = [np.ones(3)] * 5 + [np.array([0.1, 0.1, 1.0])] * 2  # the last: about the optical axis
+    shapes = zip((TYPICAL_SIZES, *near), axes, strict=True)
     sizes_of = [np.outer(np.repeat(of, 2), axis).ravel() for of, axis in shapes]
     every = [factor * sizes for sizes in sizes_of for factor in FACTORS]
     prior = np.tile(-0.5 * (np.log(FACTORS) / np.log(10.0)) ** 2, 7)
-    prior[: 2 * len(FACTORS)] -= 4.0
+    prior[-2 * len(FACTORS) :] -= 4.0
     prior -= logsumexp(prior)
     rest = errors @ errors / noise**2 + prior_cost + first @ (dense.T @ errors / noise**2 + slope)
     for sizes, before in zip(every, prior, strict=True):
@@ -176,6 +176,28 @@ def test_vibration_is_integrated_as_over_dense_matrices():
     gain, hiding, _ = hidden(lines, every_point, shared, known, noise, freedom, math.inf, VIBRATION)
     assert gain == pytest.approx(found.gain, abs=1e-9)
     alike(hiding, shown[:12, :12], np.sqrt(np.diag(poses)), atol=1e-6)
+
+
+def test_no_size_that_a_large_vibration_shows_is_left_out():
+    """Small sizes of its frequency explain less than another spectrum does."""
+    truth, lines, _, _ = shaking()
+    (turns, _), known, shared = whole_waves(lines), known_at(PRIOR, truth), nothing_shared(40)
+    of_cycles = np.exp(-0.5 * (np.log(CYCLES / 5.0) / 0.2) ** 2)
+    wave = np.outer(np.repeat(of_cycles, 2), [1.0, 1.0, 0.0]).ravel()
+    wave *= np.random.default_rng(1).normal(size=84)
+    wave *= 128.0 * np.linalg.norm(TYPICAL_SIZES) / np.linalg.norm(wave)
+    far = lines._replace(errors=lines.errors + (turns @ wave).reshape(40, 2))
+    linear = linear_of(far, np.ones(40, bool), True, shared)
+
+    def fitted(odds):
+        prior = VIBRATION._replace(odds=odds)
+        return fit(linear, shared, known, Noise(0.5, 1.0, 18.0), prior, True)
+
+    count = len(VIBRATION.odds)
+    alone = [fitted(np.where(np.arange(count) == k, 0.0, -np.inf)).gain for k in range(count)]
+    logs = VIBRATION.odds + alone
+    expected = np.exp(logs - logsumexp(logs))
+    np.testing.assert_allclose(fitted(VIBRATION.odds).weights, expected, atol=0.01)
 
 
 @pytest.mark.parametrize("name", ["turn", "shared"])

@@ -18,7 +18,6 @@ from ..moving import pinhole  # noqa: TID252 - Python has a package "test"
 from .frames import changed, frame
 
 FREE = motion_terms((0.0, 0.0), (0.0, 0.0))
-ROWS = 1.0  # range of the row times
 
 
 class Solver:
@@ -50,7 +49,7 @@ def run(observations, solver, *pools):
     """The search by pools of equal shares."""
     mock = replace(find_solver("r6p_vcwt"), solve=solver)
     hypotheses = search.Hypotheses(mock, 50, 2000, 8.0, 2.0, 1.0, 5, 0.99)
-    alike = [search.Pool.of(points, ROWS, 1.0, 0) for points in pools]
+    alike = [search.Pool.of(points, 1.0, 0) for points in pools]
     observed = SimpleNamespace(observations=observations, random=search.generator(1))
     return search.search(observed, hypotheses, FREE, alike, np.eye(3), search.NOTHING)
 
@@ -85,9 +84,8 @@ def samples_of(as_python):
 
     def samples_of(pool, count, size, tau):
         samples = np.full((count, size), -1)
-        drawn(
-            search.Pool.of(pool, float(np.ptp(tau)), 1.0, 0), 0, tau, search.generator(0), samples
-        )
+        camera, random = np.zeros(len(tau), np.int64), search.generator(0)
+        drawn(search.Pool.of(pool, 1.0, 0), 0, tau, camera, random, samples)
         return samples
 
     return samples_of
