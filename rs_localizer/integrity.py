@@ -142,10 +142,11 @@ class SeenLandmarks:
             self._counts = self._counts[[self._places[key] for key in here] + [-1]]
             self._places = {key: place for place, key in enumerate(here)}
         places = self._places
-        place = [places.setdefault(key, len(places)) for key in keys.tolist()]
+        place = np.array([places.setdefault(key, len(places)) for key in keys.tolist()], np.int64)
         if len(places) >= len(self._counts):  # twice as many, so that few are copied
             self._counts = np.concatenate([self._counts, np.zeros((len(places), 2))])
-        self._counts[place] += np.stack([np.ones(len(keys)), kept], axis=1)
+        self._counts[place, 0] += 1.0
+        self._counts[place[kept], 1] += 1.0
 
     def stale(self, keys: Array) -> BoolArray:
         """Return which landmarks, by key, were seen too often to be unmatched by chance."""

@@ -41,9 +41,9 @@ def altered(one: _Frozen, **parts: Any) -> _Frozen:
 
     Takes a third of the time of ``dataclasses.replace``.
     """
-    other, names = object.__new__(type(one)), vars(type(one))["__dataclass_fields__"]
-    for name, value in ({name: getattr(one, name) for name in names} | parts).items():
-        object.__setattr__(other, name, value)
+    other, put = object.__new__(type(one)), object.__setattr__
+    for name in vars(type(one))["__dataclass_fields__"]:
+        put(other, name, parts[name] if name in parts else getattr(one, name))
     return other
 
 

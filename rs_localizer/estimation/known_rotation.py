@@ -67,7 +67,7 @@ def coupled_turn(rotation: RotationPrior, predicted: bool) -> CoupledTurn:
     informations, volumes = map(np.array, zip(*map(inverse_of, each), strict=True))
     odds = np.full(len(each), math.log((1.0 - _COMPLETE) / (len(each) - 1)))
     odds[0] = math.log(_COMPLETE)
-    return CoupledTurn(by_motion, TurnPrior(informations, -volumes, odds))
+    return CoupledTurn(by_motion, TurnPrior(informations, np.ones(1), -volumes, odds))
 
 
 def whole_covariance(covariance: Array) -> Array:

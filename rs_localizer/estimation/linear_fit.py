@@ -137,20 +137,22 @@ _HOPELESS, _NO_PART = 7.0, 1e-3
 _MOST_TOLD = 5.0
 # Points whose columns are multiplied at a time.
 _PART = 64
+_ONE = np.ones(1)
 
 
 class TurnPrior(NamedTuple):
     """Prior of the in-frame rotation: some Gaussians about zero, by spectrum and rising size."""
 
-    informations: Array3  # (k,54,54) of the coefficients
-    volumes: Array1  # (k,) half the logarithms of their determinants
-    odds: Array1  # (k,) logarithms of the probabilities; minus infinity: not looked at
+    informations: Array3  # (k,54,54) of the coefficients, of each spectrum
+    scales: Array1  # (s,) factors of them, of each size
+    volumes: Array1  # (ks,) half the logarithms of the determinants of the products
+    odds: Array1  # (ks,) logarithms of the probabilities; minus infinity: not looked at
 
     @classmethod
-    def of(cls, informations: Array, odds: Array) -> TurnPrior:
+    def of(cls, informations: Array, odds: Array, scales: Array = _ONE) -> TurnPrior:
         """Return the prior with these logarithms of the odds, up to a constant."""
-        volumes = 0.5 * np.linalg.slogdet(informations)[1]
-        return cls(informations, volumes, odds - np.logaddexp.reduce(odds))
+        volumes = 0.5 * np.add.outer(np.linalg.slogdet(informations)[1], TURNS * np.log(scales))
+        return cls(informations, scales, volumes.ravel(), odds - np.logaddexp.reduce(odds))
 
 
 def _vibration() -> TurnPrior:
@@ -163,10 +165,9 @@ def _vibration() -> TurnPrior:
         inverse = np.linalg.inv(IN_COMBINATIONS * np.repeat(sizes, 2) ** 2 @ IN_COMBINATIONS.T)
         shapes.append(np.kron(inverse, np.diag(axes**-2.0)))
     shapes.insert(0, np.eye(TURNS))  # the likeliest first, so that others are soon out of question
-    informations = np.array(shapes)[:, None] / FACTORS[:, None, None] ** 2
     odds = np.tile(-0.5 * (np.log(FACTORS) / _DECADE) ** 2, (len(shapes), 1))
     odds[-len(_ROLLS) :] -= _RARE
-    return TurnPrior.of(informations.reshape(-1, TURNS, TURNS), odds.ravel())
+    return TurnPrior.of(np.array(shapes), odds.ravel(), FACTORS**-2.0)
 
 
 VIBRATION = _vibration()
@@ -175,7 +176,7 @@ vibration are independent, and of size 1; vibration of the same mean square abou
 beside it. A motor is seen below the noise only by its frequency: over a track, the spectrum about
 that gains 0.15 of evidence a frame, where the ordinary one loses 0.01 (0.017 deg at 140 Hz, 0.7
 px). If frames show the vibration, these spectra halve the errors of twists."""
-NO_TURN = TurnPrior(np.zeros((0, TURNS, TURNS)), np.zeros(0), np.zeros(0))
+NO_TURN = TurnPrior(np.zeros((0, TURNS, TURNS)), _ONE, np.zeros(0), np.zeros(0))
 """Prior for products that have no columns of an in-frame turn."""
 
 
@@ -210,9 +211,19 @@ def smooth_columns(by_motion: Array3, rays: Array2, bend: Array2) -> Array:
             for k in range(bend.shape[1]):
                 bent[i, :, 3 * k : 3 * k + 3] = -bend[i, k] * by_motion[i, :, MOVE]
         return bent
-    columns = np.zeros((count, 2, 2 * TERMS))
-    places, powers = _places_of(by_motion, rays), np.ones((3, DEGREE + 1))
+    columns, terms = np.zeros((count, 2, 2 * TERMS)), _terms_of(by_motion, rays)
     for i in range(count):
+        write(columns[i, 0, :TERMS], terms[i])
+        write(columns[i, 1, TERMS:], terms[i])
+    return columns
+
+
+@kernel
+def _terms_of(by_motion: Array, rays: Array) -> Array:
+    """Return functions (n,t) of places in image and depth, along one side of the image."""
+    places, powers = _places_of(by_motion, rays), np.ones((3, DEGREE + 1))
+    terms = np.empty((len(rays), TERMS))
+    for i in range(len(rays)):
         for axis in range(3):
             power, x = powers[axis], places[i, axis]
             power[1] = x
@@ -222,8 +233,8 @@ def smooth_columns(by_motion: Array3, rays: Array2, bend: Array2) -> Array:
             value = _TERM_SIZES[place]
             for axis in range(3):
                 value *= powers[axis, _POWERS[place, axis]]
-            columns[i, 0, place] = columns[i, 1, TERMS + place] = value
-    return columns
+            terms[i, place] = value
+    return terms
 
 
 @kernel
@@ -283,16 +294,17 @@ def smooth_error(lines: Lines, chosen: BoolArray1, bend: Array2, size: float) ->
         bend: (n,b), or (n,0): see :func:`smooth_columns`.
         size: px; its logarithm is known with a deviation of 1.
     """
-    columns = smooth_columns(lines.by_motion[chosen], lines.image[chosen], bend[chosen])
-    flat = columns.reshape(2 * len(columns), -1)
+    by_motion, rays = lines.by_motion[chosen], lines.image[chosen]
     of_image = bend.shape[1] == 0  # u and v have the same functions
     if of_image:
-        flat = np.ascontiguousarray(columns[:, 0, :TERMS])
+        flat = _terms_of(by_motion, rays)
+    else:
+        flat = smooth_columns(by_motion, rays, bend[chosen]).reshape(2 * len(rays), -1)
     values, axes = np.linalg.eigh(flat.T @ flat)
     kept = np.flatnonzero(values > _LEAST_SQUARE * max(values[-1], 1e-300))
     squares = values[kept]
     combined = flat @ np.ascontiguousarray(axes[:, kept]) / np.sqrt(squares)
-    rows = np.empty((2, len(columns), len(squares)))
+    rows = np.empty((2, len(rays), len(squares)))
     for side in range(2):
         rows[side] = combined if of_image else combined[side::2]
     if of_image:
@@ -595,7 +607,8 @@ def _over_turns(
     gain = fall = 0.0
     if np.all(np.isfinite(equations)):
         for k in range(count):
-            if k == 0 or prior.volumes[k] > prior.volumes[k - 1]:
+            spectrum, place = k // len(prior.scales), k % len(prior.scales)
+            if place == 0:
                 gain = fall = 0.0  # another spectrum, of which the smallest size is next to none
             # Evidence that falls from one size to the next falls no less to the one after it.
             if fall < 0.0 and prior.odds[k] + gain + fall < best - _HOPELESS:
@@ -604,9 +617,10 @@ def _over_turns(
                 continue
             whole = wholes[k % len(wholes)]
             for i in range(size):
-                row, own, more = whole[i, i:], equations[i, i:], prior.informations[k, i, i:]
+                row, own = whole[i, i:], equations[i, i:]
+                more, factor = prior.informations[spectrum, i, i:], prior.scales[place]
                 for j in range(len(more)):
-                    row[j] = own[j] + more[j]
+                    row[j] = own[j] + factor * more[j]
                 write(whole[i, size:], equations[i, size:])
             eliminate(whole, size)
             before, gain = gain, prior.volumes[k]

@@ -294,13 +294,13 @@ def _with_term(terms: PriorTerms, information: Array, reference: Array, pivot: A
 
 def knows_motion(prior: Prior) -> bool:
     """Return True if a prior's motion is more than a first guess."""
-    return prior.covariance is not None and not np.isinf(np.diagonal(prior.covariance)).all()
+    return prior.covariance is not None and not np.isinf(prior.covariance.diagonal()).all()
 
 
 def knows_speed(terms: PriorTerms, prior: Prior) -> bool:
     """Return True if a prior knows the linear velocity better than the terms do."""
-    default = np.diagonal(terms.informations[0])[LINEAR]
-    return bool(np.all(np.diagonal(np.asarray(prior.covariance))[LINEAR] * default < 1.0))
+    default = terms.informations[0].diagonal()[LINEAR]
+    return bool((np.asarray(prior.covariance).diagonal()[LINEAR] * default < 1.0).all())
 
 
 def at_speed(terms: PriorTerms, speed: float) -> PriorTerms:
