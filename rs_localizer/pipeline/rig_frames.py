@@ -20,14 +20,8 @@ from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.core.rig import ByCamera, Rig, RigEstimate
+from rs_localizer.io import clouds
 from rs_localizer.io.camera_info import Calibration
-from rs_localizer.io.clouds import (
-    Correspondences,
-    Keypoints,
-    make_rows,
-    read_correspondences,
-    read_keypoints,
-)
 from rs_localizer.io.outputs import CameraShare, Localized
 from rs_localizer.io.topics import CORRESPONDENCES
 from rs_localizer.io.transforms import Transform, TransformError, Transforms
@@ -52,7 +46,7 @@ class CameraImage:
     camera: str
     start_ns: int  # exposure of the first row
     middle_ns: int  # of the exposure
-    cloud: Correspondences
+    cloud: clouds.Correspondences
 
 
 class FrameAssembler:
@@ -153,7 +147,7 @@ class FrameAssembler:
         self._notice(Notice.NO_IMAGES, f"{name} is left out: {why}")
 
 
-def joined(names: Sequence[str], images: Sequence[CameraImage]) -> Correspondences:
+def joined(names: Sequence[str], images: Sequence[CameraImage]) -> clouds.Correspondences:
     """Join correspondences of all images, with the stamp of the first one.
 
     Its rows have the fields that all have, and their camera.
@@ -161,8 +155,7 @@ def joined(names: Sequence[str], images: Sequence[CameraImage]) -> Correspondenc
     Args:
         names: of all cameras of the rig.
     """
-    clouds = [image.cloud for image in images]
-    tables = [cloud.table for cloud in clouds]
+    tables = [image.cloud.table for image in images]
     fields = [
         name
         for name in tables[0].dtype.names or ()
@@ -172,8 +165,9 @@ def joined(names: Sequence[str], images: Sequence[CameraImage]) -> Correspondenc
     kinds = [(name, of.dtype.newbyteorder("<")) for name, of in zip(fields, columns, strict=True)]
     places = [names.index(image.camera) for image in images]
     columns.append(np.repeat(places, [len(table) for table in tables]))
-    table = make_rows([*kinds, ("camera", "u1")], columns)
-    return replace(clouds[0], table=table, dropped=sum(cloud.dropped for cloud in clouds))
+    table = clouds.make_rows([*kinds, ("camera", "u1")], columns)
+    dropped = sum(image.cloud.dropped for image in images)
+    return replace(images[0].cloud, table=table, dropped=dropped)
 
 
 def share_of(image: CameraImage, result: RigEstimate) -> CameraShare:
@@ -268,15 +262,15 @@ class RigFrames(FrameLocalizer):
 
     def _read(
         self, name: str, kind: str, message: Any, camera: Camera
-    ) -> Correspondences | Refusal:
+    ) -> clouds.Correspondences | Refusal:
         """Return the correspondences of one camera's message."""
         read: Callable[[Any], Any]
-        read = read_correspondences if kind == CORRESPONDENCES else read_keypoints
-        found: Correspondences | Keypoints | Refusal
+        read = clouds.read_correspondences if kind == CORRESPONDENCES else clouds.read_keypoints
+        found: clouds.Correspondences | clouds.Keypoints | Refusal
         found = read_or_refuse(read, message, INPUTS[kind].refused)
         if isinstance(found, Refusal):
             return replace(found, detail=f"{name}: {found.detail}")
-        if isinstance(found, Correspondences):
+        if isinstance(found, clouds.Correspondences):
             return found
         by = self.landmarks.matching_by(found)
         if isinstance(by, Refusal):
