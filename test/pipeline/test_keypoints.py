@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import rs_localizer.pipeline.keypoint_map
+import rs_localizer.matching
 from benchmarks.fuzzing import map_rows
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
@@ -160,7 +160,7 @@ def test_a_wrong_prediction_is_found_out(frames, make_camera_info, monkeypatch):
             asked.append(arguments[2] is not None)
             return super().match(*arguments)
 
-    monkeypatch.setattr(rs_localizer.pipeline.keypoint_map, "Matcher", Asked)
+    monkeypatch.setattr(rs_localizer.matching, "Matcher", Asked)
     node = localizer(make_camera_info)
     node.landmarks.use_map(read_map(map_cloud(LANDMARKS)))
     for frame in frames[:3]:
