@@ -75,7 +75,7 @@ def detect(args: Options) -> Figures:
     """Detect in the images of one recording, of each camera of a rig, and say what came of it."""
     of_map, detect_images = _of_markers(args) if args.features is None else _of_features(args)
     settings, warnings = build(shutter_values(args)), list[str]()
-    every = list[tuple[int, int, float]]()
+    every = list[tuple[int, int, float, float]]()
     kind = "keypoints" if args.features else "corners"
     with atomic_directory(args.out, earlier_result(args, "metadata.yaml")) as out:
         with BagWriter(out) as bag:
@@ -92,10 +92,14 @@ def detect(args: Options) -> Figures:
                     options = offline.DetectionOptions(args.with_images, of.scan_direction, name)
                     found = detect_images(shots, bag, options)
                 count, median = len(found.counts), float(np.median(found.counts))
-                every.append((found.images, count, median))
+                every.append((found.images, count, median, found.residual))
                 said = f"{count} of {found.images} images, {median:.0f} {kind}"
-                said += f" ({args.features})" if args.features else ""
-                print(f"{f'{args.out}, {name}' if name else args.out}: {said} each (median)")
+                said += f" ({args.features}) each (median)" if args.features else " each (median)"
+                if np.isfinite(found.residual):
+                    said += (
+                        f", within {found.residual:.3f} px rms of a global-shutter pose (median)"
+                    )
+                print(f"{f'{args.out}, {name}' if name else args.out}: {said}")
                 print("".join(f"note {note}\n" for note in found.notes), end="")
                 if kept := [f"{topic} ({count})" for topic, count in found.carried.items()]:
                     print(f"kept for replay: {', '.join(kept)}")
@@ -105,8 +109,10 @@ def detect(args: Options) -> Figures:
                 warnings += found.faults
         if values := {**of_map, **shutter_values(args)}:
             write_parameters(out / PARAMETERS, values)
-    images, counts, medians = zip(*every, strict=True)
+    images, counts, medians, residuals = zip(*every, strict=True)
     figures: Figures = {"images": sum(images), f"with_{kind}": sum(counts), kind: min(medians)}
+    if not args.features:
+        figures |= {"residual_of_a_still_pose_px": max(residuals)}
     return figures | {"warnings": "; ".join(warnings)}
 
 

@@ -7,8 +7,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.scanning import ScanDirection
@@ -28,6 +30,13 @@ from rs_localizer.offline.image_sources import Carried, Shot
 from rs_localizer.pipeline.keypoints import FrameExtractor, keypoints
 from rs_localizer.pipeline.marker_detector import FrameDetector, correspondences
 from rs_localizer.pipeline.refusal import Refusal
+
+# Fewer corners than this say nothing about how well a pose fits.
+_LEAST_CORNERS = 6
+# A global-shutter pose leaves at most so much (px rms) in the stillest images, in percent of all,
+# unless calibration or map are wrong: a good one leaves 0.1 to 0.5. No readout takes longer than
+# the time between two images: who leaves less than what moved between them may just have moved.
+_MOST_STILL, _STILL_PERCENT = 1.5, 10.0
 
 
 @dataclass(slots=True)
@@ -53,6 +62,7 @@ class Extraction(ImageTally):
     carried: Counter[str] = field(default_factory=Counter)  # messages of other topics
     faults: tuple[str, ...] = ()  # what speaks against map or calibration
     notes: tuple[str, ...] = ()  # what the detector says of some images
+    residual: float = np.nan  # px rms, median, of the best global-shutter poses
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,13 +87,15 @@ def record_markers(
         ValueError: when no image shows anything.
     """
     found, others, faults = Extraction(), Counter[str](), Counter[str]()
-    kept = _kept(shots, bag, found)
-    for shot, image, _ in usable(kept, options.scan_direction, found):
+    kept, still = _kept(shots, bag, found), _StillImages()
+    for shot, image, camera in usable(kept, options.scan_direction, found):
         detected = detector.detect(image)
         others.update(detected.detections.unknown)
         faults.update(detected.detections.faults)
         if count := len(detected.detections.ids):
             found.counts.append(count)
+            assert camera is not None
+            still.add(camera, detected.detections.points, detected.detections.pixels)
             corners = correspondences(detected, make_message)
             _write(bag, shot, CORRESPONDENCES_TOPIC, corners, options)
     if not found.counts:
@@ -93,8 +105,60 @@ def record_markers(
             f"none of the {found.images} images{of} shows anything of the map "
             f"({_wanted(detector.map)}){why and '; '}{why}"
         )
-    found.faults = tuple(filter(None, [detector.mistake]))
+    found.faults = tuple(filter(None, [detector.mistake or still.fault]))
+    found.residual = float(np.nanmedian([np.nan, *still.residuals]))
     return found
+
+
+class _StillImages:
+    """What global-shutter poses leave, and whether motion during the readout may be why."""
+
+    def __init__(self) -> None:
+        self.residuals: list[float] = []  # px rms
+        self._telling: list[float] = []  # those that are not of motion
+        self._before: dict[tuple[float, ...], Array] = {}  # pixels of the image before, by point
+
+    def add(self, camera: Camera, points: Array, pixels: Array) -> None:
+        """Take the corners of an image."""
+        now = dict(zip(map(tuple, points.tolist()), pixels, strict=True))
+        before, self._before = self._before, now
+        moved = [now[point] - before[point] for point in now.keys() & before.keys()]
+        residual = static_residual(camera, points, pixels)
+        if not np.isfinite(residual):
+            return
+        self.residuals.append(residual)
+        if residual <= _MOST_STILL or (moved and _rms(np.array(moved)) < residual):
+            self._telling.append(residual)
+
+    @property
+    def fault(self) -> str:
+        """Why the calibration, or the map, can hardly be right; '' if it may be."""
+        least = np.percentile(self._telling, _STILL_PERCENT) if self._telling else 0.0
+        if least <= _MOST_STILL:
+            return ""
+        return (
+            f"even the stillest images leave {least:.1f} px rms: the calibration can hardly be of "
+            "this camera in this mode, or the map (sizes, positions) is wrong"
+        )
+
+
+def _rms(steps: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(np.square(steps), axis=1))))
+
+
+def static_residual(camera: Camera, points: Array, pixels: Array) -> float:
+    """Return the error (px rms) of the best global-shutter pose; NaN if there is none."""
+    if len(points) < _LEAST_CORNERS:
+        return np.nan
+    rays = np.ascontiguousarray(camera.rays(pixels))
+    try:
+        solved, turn, shift = cv2.solvePnP(points, rays, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
+    except cv2.error:
+        return np.nan
+    if not solved:
+        return np.nan
+    seen = camera.project(points @ np.asarray(cv2.Rodrigues(turn)[0]).T + np.ravel(shift))
+    return _rms(seen - pixels)
 
 
 def _wanted(marker_map: MarkerMap) -> str:

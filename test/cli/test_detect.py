@@ -156,7 +156,7 @@ def test_bag_of_markers(here, capsys):
     (bag / "parameters.yaml").write_text("rs_localizer: {ros__parameters: {readout_time: 0.02}}")
     assert detect(here, bag, *here.map) == 0
     said = capsys.readouterr().out
-    assert "2 of 4 images, 8 corners each (median)\n" in said
+    assert "2 of 4 images, 8 corners each (median), within 0." in said
     assert "the first one because the data are truncated" in said
     first, second = clouds(here.out)
     assert (first.stamp_ns, second.stamp_ns) == (5 * 10**9, 7 * 10**9)
@@ -217,6 +217,30 @@ def test_what_is_seen_instead_is_named(here, capsys):
     shows = r"shows anything of the map \(chessboard 6x4\); are these its inner corners"
     assert re.search(f"detect: none of the 6 images {shows}", said)
     assert not here.out.exists()
+
+
+def test_a_wrong_calibration_is_named(here, capsys):
+    (here.path / "cameras.txt").write_text(LENS.replace("300 300", "300 900"))
+    images = folder(here.path / "images", [board()] * 3)
+    assert detect(here, images, *here.calibration, *here.board, "--rate", "30") == 0
+    said = capsys.readouterr().out
+    assert re.search(r"warning: even the stillest images leave \d+\.\d px rms: the calib", said)
+
+
+def test_motion_during_the_readout_is_no_fault_of_the_calibration(here, capsys):
+    """Each row of an image is half a pixel beside the one above; the next image is 100 px off."""
+    images = [
+        cv2.warpAffine(
+            board(x=0.075 * side), np.array([[1.0, 0.5 * side, -60.0 * side], [0, 1, 0]]),
+            (320, 240), borderMode=cv2.BORDER_REPLICATE,
+        )
+        for side in (1, -1) * 3
+    ]  # fmt: skip
+    source = folder(here.path / "images", images)
+    assert detect(here, source, *here.calibration, *here.board, "--rate", "30") == 0
+    said = capsys.readouterr().out
+    assert float(re.search(r"within (\S+) px rms of a global-shutter pose", said)[1]) > 1.5
+    assert "warning" not in said
 
 
 @pytest.mark.parametrize(("first", "last", "code"), [(0, 1, 0), (5, 6, 0), (0, 12, 1)])

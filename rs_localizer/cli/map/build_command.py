@@ -28,7 +28,7 @@ from rs_localizer.io.trajectories import Trajectory, write_tum
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.settings import build, write_parameters
 from rs_localizer.tools.mapping.anchors import Anchors, PointSight
-from rs_localizer.tools.mapping.build import Built, Given, build_map, result_rows
+from rs_localizer.tools.mapping.build import Built, Given, build_map, filming_advice, result_rows
 from rs_localizer.tools.mapping.structure import Looked, Looker, look_through, require
 
 
@@ -151,5 +151,7 @@ def _print_result(args: Options, built: Built, looked: Looked) -> None:
         )
     if built.readout_check is not None and built.readout_check.differs:
         print(f"warning: {built.readout_check.message}; the map has what was estimated")
+    for text in filming_advice(built, looked.views):
+        print(f"to film otherwise: {text}")
     following = typed("replay", "IMAGES", "--map", str(args.out), "--out", "poses")
     print(f"next, for images of another walk: {following}")

@@ -356,6 +356,51 @@ def _shared(built: Built) -> float:
     return 1e3 * float(np.median(np.linalg.norm(built.landmarks.error_modes, axis=(1, 2))))
 
 
+# Advice is given where more than this share of the images has no pose.
+_MANY = 0.1
+# A walk comes back if this share of what its last images show was shown by its first ones, a tenth
+# of all each. What lies between holds together by neighbours alone, whose errors add up.
+_AGAIN, _ENDS = 0.1, 0.1
+
+
+def filming_advice(built: Built, views: Sequence[SeenImage]) -> list[str]:
+    """Return sentences on how to film a better map."""
+    said, lost = list[str](), np.setdiff1d(np.arange(len(views)), built.posed)
+    if len(lost) > _MANY * len(views):
+        begin, last = (1e-9 * (views[k].stamp_ns - views[0].stamp_ns) for k in lost[[0, -1]])
+        said.append(
+            f"{len(lost) / len(views):.0%} of the images, from {begin:.1f} to {last:.1f} s, have "
+            "no pose: film there more slowly"
+        )
+    if len(built.structure.parts) > 1:
+        said.append(
+            f"{sum(built.structure.parts[1:])} keyframes are not connected with the others: film "
+            "what lies between, and come back to where you began"
+        )
+    if not comes_back(built.structure.seen):
+        unit = "mm" if built.placement.scaled else "thousandths of the map's unit"
+        said.append(
+            f"the last images show nothing that the first ones do: landmarks share errors of "
+            f"{_shared(built):.1f} {unit}, larger ones towards the ends; come back to where you "
+            "began, or show markers at both ends"
+        )
+    if not (built.shutter.visible if built.shutter else not built.refined.apart):
+        said.append(
+            "for the readout time, film at the camera's own rate (no time lapse, no stabilization) "
+            "and rotate the camera quickly, sideways and up and down, for some seconds"
+        )
+    return said
+
+
+def comes_back(seen: MapObservations) -> bool:
+    """Return whether the last images show landmarks that the first ones show."""
+    count = len(seen.stamps_ns)
+    ends = max(1, round(_ENDS * count))
+    first = np.unique(seen.landmarks[seen.images < ends])
+    last = np.unique(seen.landmarks[seen.images >= count - ends])
+    return len(np.intersect1d(first, last)) >= _AGAIN * min(len(first), len(last))
+
+
 def _shutter(built: Built) -> str:
     fit, known = built.shutter, built.camera.readout_time
     if fit is None:
