@@ -111,7 +111,7 @@ def record_markers(
 
 
 class _StillImages:
-    """What global-shutter poses leave, and whether motion during the readout may be why."""
+    """Residuals of global-shutter poses, of which some are those of motion during the readout."""
 
     def __init__(self) -> None:
         self.residuals: list[float] = []  # px rms
@@ -132,7 +132,7 @@ class _StillImages:
 
     @property
     def fault(self) -> str:
-        """Why the calibration, or the map, can hardly be right; '' if it may be."""
+        """The reason why calibration or map can hardly be right; empty if they may be."""
         least = np.percentile(self._telling, _STILL_PERCENT) if self._telling else 0.0
         if least <= _MOST_STILL:
             return ""
