@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, Array1, Array2, BoolArray
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.rig import Exposure
 from rs_localizer.core.state import (
@@ -29,11 +29,10 @@ from rs_localizer.core.state import (
 )
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.calibration import CalibrationEffect, longest_axis, promised
-from rs_localizer.estimation.gaussian import along_arcs
+from rs_localizer.estimation.gaussian import along_arcs, is_motion
 from rs_localizer.estimation.hypotheses import Posterior
 from rs_localizer.estimation.known_rotation import with_turn
 from rs_localizer.estimation.points import Observed, Usable
-from rs_localizer.native import entry
 
 # Errors as large as the gate lets them be are those of points strewn over it.
 # A global shutter leaves errors of the motion beside the noise. In inlier thresholds.
@@ -44,8 +43,6 @@ MOST_TURN = 0.07
 # hand-held boards of 12 to 20 cm come to 1.5 times (benchmarks.real), and beyond three a covariance
 # no longer says where a pose on an arc may be.
 _OPEN = 3.0
-# Rotations are orthonormal to this, also where thousands of steps have rounded them.
-_ROUNDED = 1e-6
 # Points that lie closer together than this (px) show no perspective.
 _LEAST_EXTENT = 5.0
 
@@ -95,7 +92,7 @@ def refusal(
             f"{found} inliers do not determine the motion: smallest eigenvalue of the scaled "
             f"information {posterior.smallest_eigenvalue:.1e}",
         )
-    if not _is_motion(posterior.state, posterior.covariance):
+    if not is_motion(posterior.state, posterior.covariance):
         return Failure(
             Reason.DEGENERATE,
             f"{found} inliers leave the motion so open that it cannot be computed",
@@ -108,14 +105,6 @@ def refusal(
             "too small for the noise; set map_deviation, if points of the map are that far off",
         )
     return None
-
-
-@entry
-def _is_motion(state: Array1, covariance: Array2) -> bool:
-    """Return whether both are finite, and the rotation is one: points on a line let it run away."""
-    turn = state[:9].copy().reshape(3, 3)
-    off = np.max(np.abs(turn @ turn.T - np.eye(3)))
-    return bool(np.all(np.isfinite(state)) and np.all(np.isfinite(covariance)) and off < _ROUNDED)
 
 
 def too_few(inliers: BoolArray, squared_errors: Array, samples: int, needed: int) -> Failure:

@@ -253,13 +253,13 @@ class CameraCalibration:
 def calibrate_either_axis(
     camera: Camera, images: list[ImagePoints], **known: Any
 ) -> CameraCalibration:
-    """Calibrate as :func:`calibrate`, and along the other axis if the film seems processed.
+    """Calibrate as :func:`calibrate`, and along the other axis if that is not believed.
 
     The other axis is returned if its readout time is believed and it leaves less noise: an image
     that is scanned across the assumed axis looks like one of a stabilizer.
     """
     found = calibrate(camera, images, **known)
-    if found.processed:
+    if found.disbelief:
         across = replace(camera, scan_direction=ACROSS[ScanDirection(camera.scan_direction)])
         with suppress(ValueError):  # a wrong axis may determine nothing
             other = calibrate(across, images, **known)
