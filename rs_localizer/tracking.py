@@ -78,7 +78,7 @@ _COUNTED, _SINCE_1970 = 1_000_000, ((10**9, 4 * 10**9), (10**12, 4 * 10**12))
 # Weight of the newest frame in the share of inliers of the last frames.
 _NEWEST = 0.3
 # Least part of its inliers that a frame keeps by the motion of all frames: fewer, and they do not
-# hang together. (Right tracks of the paired set and of 15 real boards keep more.)
+# hang together. No figure of the paired set or of 15 real boards changes by it.
 _STILL_FITTING = 0.7
 # Largest squared distance of a searched motion from the track: once in a million by chance.
 _MOST_INNOVATION = 62.0

@@ -106,7 +106,8 @@ def record_markers(
             f"({_wanted(detector.map)}){why and '; '}{why}"
         )
     found.faults = tuple(filter(None, [detector.mistake or still.fault]))
-    found.residual = float(np.nanmedian([np.nan, *still.residuals]))
+    if still.residuals:
+        found.residual = float(np.median(still.residuals))
     return found
 
 

@@ -219,6 +219,14 @@ def test_what_is_seen_instead_is_named(here, capsys):
     assert not here.out.exists()
 
 
+def test_one_marker_tells_nothing_of_the_calibration(here, capsys):
+    """Any lens leaves as little of its four corners."""
+    write_marker_map(here.path / "map.yaml", MarkerMap(MARKERS.markers[:1]))
+    image_bag(here.path / "bag", [markers()])
+    assert detect(here, here.path / "bag", *here.map) == 0
+    assert "1 of 1 images, 4 corners each (median)\n" in capsys.readouterr().out
+
+
 def test_a_wrong_calibration_is_named(here, capsys):
     (here.path / "cameras.txt").write_text(LENS.replace("300 300", "300 900"))
     images = folder(here.path / "images", [board()] * 3)
