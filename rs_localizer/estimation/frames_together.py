@@ -364,18 +364,25 @@ def _lines_of(
     columns, errors = np.zeros((count, 2, _OWN + _SHARED)), lines.errors.copy()
     by_own = lines.by_motion.reshape(2 * count, PARAMETERS) @ by_number
     columns[:, :, : _OWN + 1] = by_own.reshape(count, 2, _OWN + 1)
-    for i in range(count):
-        radial = frame.rays[i] * (np.sum(frame.rays[i] ** 2) / (lens[2] ** 3 * lens[3]))
+    by_place = lines.by_motion[:, :, MOVE].copy().reshape(2 * count, 3) @ rotation
+    for i in range(count):  # a number at a time: arrays of two take longer
+        x, y = frame.rays[i]
+        radial = (x * x + y * y) / (lens[2] ** 3 * lens[3])
         for side in range(2):
             shared, given = columns[i, side, _OWN:], frame.by_ray[i, side]
-            by_image = by_ray[i, side] * lines.image[i]
-            shared[_LENGTH] = np.sum(by_image) + length * np.sum(given * lens[:2])
-            shared[_RATIO] = np.sum(by_image * _ASPECT)
+            across = by_ray[i, side, 0] * lines.image[i, 0]
+            down = by_ray[i, side, 1] * lines.image[i, 1]
+            moved = length * (given[0] * lens[0] + given[1] * lens[1])
+            shared[_LENGTH] = across + down + moved
+            shared[_RATIO] = across * _ASPECT[0] + down * _ASPECT[1]
             shared[_LENS.start + side] = 1.0
-            shared[_LENS.stop - 1] = np.sum(given * radial)
-            by_point = lines.by_motion[i, side, MOVE] @ rotation
-            shared[_MAP] = by_point @ frame.moved[i]
-            errors[i, side] += np.sum(shared[_LENS.start :] * numbers[_LENS.start :])
+            shared[_LENS.stop - 1] = radial * (given[0] * x + given[1] * y)
+            for k in range(_SHARED - _MAP.start):
+                for axis in range(3):
+                    by_error = by_place[2 * i + side, axis] * frame.moved[i, axis, k]
+                    shared[_MAP.start + k] += by_error
+            for k in range(_LENS.start, _SHARED):
+                errors[i, side] += shared[k] * numbers[k]
     return errors, columns
 
 

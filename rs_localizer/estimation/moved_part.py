@@ -16,8 +16,8 @@ landmarks: a part is one thing, however many of its landmarks a frame shows.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Generator, Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from rs_localizer.estimation.robust import LEAST_NOISE, TINY, WIDEST_GATE
 from rs_localizer.estimation.search import GLOBAL_SHUTTER_SCALE
 
 # Frames that are compared, and after how many others at most: that takes as long as three frames.
+# Of a long track it is spread over ten.
 _LOOKS, _RARELY = 4, 120
 # Landmarks that are enough.
 _COMPARED = 200
@@ -54,6 +55,10 @@ _OTHER_LENGTH, _BESIDE = 0.5, PARAMETERS + 2
 _KEY_WEIGHTS = np.sqrt([2.0, 3.0, 5.0])
 # Of diagonals of normal equations, so that rounding leaves them positive.
 _RIDGE = 1e-9
+
+
+_Found = TypeVar("_Found")
+_Search = Generator[None, None, _Found | None]  # that goes on when it is asked, and ends so
 
 
 class Look(NamedTuple):
@@ -139,6 +144,7 @@ class MovedParts:
         """The part that frames show together: one alone may have a cause of its own."""
         self._apart = np.zeros((0, 3)), np.zeros((MOTION_PARAMETERS,) * 2)
         self._looks: list[Look] = []
+        self._search: _Search[MovedPart]
         self._count, self._next = 0, 1
 
     def add(
@@ -172,12 +178,22 @@ class MovedParts:
         stays = part is not None and _mostly_out(part.points, points, posterior.inliers)
         if not self._looks and self._count < self._next:
             return
-        self._looks.append(look_at(observed, posterior, terms))
-        if len(self._looks) in (1, _LOOKS):
-            found = moved_part(self._looks, self._map_deviation)
-            if found is not None or (len(self._looks) == _LOOKS and not stays):
-                self.part = found
-        if len(self._looks) == _LOOKS:
+        if len(self._looks) < _LOOKS:
+            self._looks.append(look_at(observed, posterior, terms))
+            if len(self._looks) not in (1, _LOOKS):
+                return
+            self._search = moved_part(self._looks, self._map_deviation)
+        together = len(self._looks) == _LOOKS
+        try:
+            while True:
+                next(self._search)
+                if together and self._count > _RARELY:  # a step a frame
+                    return
+        except StopIteration as end:
+            found = end.value
+        if found is not None or (together and not stays):
+            self.part = found
+        if together:
             self.named = found
             self._later()
 
@@ -262,21 +278,29 @@ class _Split(NamedTuple):
     way: Array  # (3,) m
 
 
-def moved_part(looks: Sequence[Look], map_deviation: float) -> MovedPart | None:
-    """Return the part of the map that lies elsewhere than the rest; None if there is none.
+def moved_part(looks: Sequence[Look], map_deviation: float) -> _Search[MovedPart]:
+    """Search, step by step, the part of the map that lies elsewhere than the rest.
 
     Args:
         looks: of one frame, or of several.
         map_deviation: m, as declared.
+
+    Returns:
+        the part, in the end; None if there is none.
     """
     frames = _Frames.of(looks)
+    yield
     fitting: BoolArray = np.any(frames.inliers, axis=0)
     nobody = np.zeros(len(fitting), np.bool_)
     beside = _beside(frames, frames.inliers, declared=False)
     alone = _fitted(frames, nobody, frames.inliers, beside)
+    yield
     starts = [_side(frames, fitting, beside), ~fitting][: 1 if fitting.all() else 2]
-    beside = _beside(frames, frames.shown, declared=True)
-    splits = [split for start in starts if (split := _settled(frames, start, beside))]
+    yield
+    beside, splits = _beside(frames, frames.shown, declared=True), []
+    for start in starts:
+        split = yield from _settled(frames, start, beside)
+        splits += [split] if split is not None else []
     best = max(splits, key=lambda split: split.gain, default=None)
     if best is None or best.gain < alone.evidence + _LEAST_CHANCE:
         return None
@@ -325,7 +349,7 @@ def _fitted(frames: _Frames, part: BoolArray, kept: BoolArray, beside: _Beside) 
     return _Shifted(way, np.sum(each**2, axis=3) * frames.shown, evidence)
 
 
-def _settled(frames: _Frames, part: BoolArray, beside: _Beside) -> _Split | None:
+def _settled(frames: _Frames, part: BoolArray, beside: _Beside) -> _Search[_Split]:
     """Let each landmark join the group that it fits, until none changes; None if one vanishes.
 
     Motions and smooth errors are, at first, those ``beside`` all landmarks that are shown.
@@ -340,6 +364,7 @@ def _settled(frames: _Frames, part: BoolArray, beside: _Beside) -> _Split | None
         if np.array_equal(part, before[0]) and np.array_equal(kept, before[1]):
             break
         fit = _fitted(frames, part, kept, _beside(frames, kept, declared=True))
+        yield
     found: BoolArray = np.any(kept, axis=0)
     count, size = int(np.count_nonzero(found)), int(np.count_nonzero(part & found))
     if not _OF_SHIFT < size < count:

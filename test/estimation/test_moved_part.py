@@ -73,17 +73,20 @@ def test_a_declared_deviation_explains_what_it_is_as_large_as():
     assert said(partial(kinds.part_moved, 0.5, 0.01), settings=declared)[2] == ""
 
 
-def test_a_camera_that_turns_on_the_spot_finds_the_part():
+@pytest.mark.parametrize("first", [0, 200])
+def test_a_camera_that_turns_on_the_spot_finds_the_part(first):
+    """At once; of a long track when it is searched again, a step a frame."""
     random = np.random.default_rng(1)
     camera, points, pixels, _ = frame("volume", "right", random)
     half = points[:, 0] > np.median(points[:, 0])
     told = points + 0.02 * half[:, None] * [0.0, 1.0, 0.0]
     tracker = Tracker(rsl.Localizer(camera), remembers_motion=False)
     rays = np.c_[camera.rays(pixels), np.ones(len(pixels))]
-    for k in range(30):
-        turn = Rotation.from_rotvec([0.0, 0.01 * (k - 15), 0.0])
+    for k in range(30 + first):
+        turn = Rotation.from_rotvec([0.0, 0.01 * (k % 30 - 15), 0.0])
         seen = camera.project(turn.apply(rays)) + random.normal(0.0, 0.1, pixels.shape)
-        tracker.localize(10**9 + 33_000_000 * k, told, seen)
+        tracker.localize(10**9 + 33_000_000 * k, points if k < first else told, seen)
+        assert tracker.moved is None or k >= first
     part = tracker.moved
     assert part is not None
     found = (told[:, None] == part.points).all(axis=2).any(axis=1)
