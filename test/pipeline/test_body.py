@@ -40,6 +40,7 @@ from rs_localizer.pipeline.map_to_odom import CorrectionState
 from rs_localizer.pipeline.published import Broadcast, broadcast
 from rs_localizer.pipeline.refusal import Refusal
 
+from ..moving import estimate_at  # noqa: TID252 - Python has a package "test"
 from .motions import covariance_of, disturbed
 
 READOUT_TIME = 0.03
@@ -86,17 +87,11 @@ def estimate() -> Estimate:
     rng = np.random.default_rng(0)
     deviations = np.repeat([0.003, 0.01, 0.02, 0.05, 0.01, 0.02], 3)
     root = rng.normal(size=(18, 18)) * deviations[:, None]
-    return Estimate(
-        rotation=Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(),
-        translation=np.array([0.1, -0.2, 2.0]),
-        angular_velocity=np.array([0.05, -0.1, 0.2]),
-        linear_velocity=np.array([0.02, 0.05, -0.01]),
-        inliers=np.ones(8, dtype=bool),
-        residuals=np.ones(8),
-        joint_covariance=root @ root.T,
-        iterations=10,
-        span=READOUT_TIME,
-    )
+    motion = Motion(
+        Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(), np.array([0.1, -0.2, 2.0]),
+        np.array([0.05, -0.1, 0.2]), np.array([0.02, 0.05, -0.01]),
+    )  # fmt: skip
+    return estimate_at(motion, 8, joint_covariance=root @ root.T, span=READOUT_TIME)
 
 
 class Chain:
