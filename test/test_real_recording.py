@@ -42,7 +42,6 @@ NEIGHBOURS = 0.09  # s between the frames before and after, none left out
 
 @pytest.fixture(scope="module")
 def recording():
-    """Calibration and clouds."""
     clouds, calibration = [], None
     with open_bag(data.path("webcam_chessboard/recording")) as bag:
         for topic, _, message in bag.messages(("/camera_info", "/correspondences")):

@@ -108,7 +108,6 @@ ROOM = ("--trajectory", "tum_vi_room5")
 
 @pytest.fixture(scope="module")
 def film(tmp_path_factory):
-    """Simulates with one camera or with both."""
     folder = tmp_path_factory.mktemp("film")
     camera = Camera(width=320, height=240, K=K, readout_time=0.03)
     write_calibration(folder / "camera.yaml", camera)
@@ -129,7 +128,6 @@ def film(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def images(film):
-    """Of the walls."""
     words = ("--images", "--start", "20", "--duration", "0.8", "--exposure", "0.002")
     return lambda which: film(which, "images", *words, "--noise", "2")
 

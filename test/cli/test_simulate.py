@@ -138,7 +138,6 @@ def evaluate(files: Path, *words: str, estimate: str = "replayed") -> int:
 
 
 def rows(text: str) -> dict[str, list[float]]:
-    """Figures of each line of the table by its name."""
     found = re.findall(r"^([^\d\n]+?(?:\([^)]*\))?) {2,}((?:\s*[\d.]+)+)$", text, re.MULTILINE)
     return {name.strip(): [float(word) for word in figures.split()] for name, figures in found}
 

@@ -192,7 +192,6 @@ POINTS = np.random.default_rng(0).uniform([-1.0, -0.8, 2.0], [1.0, 0.8, 6.0], (6
 
 
 def pose(seconds):
-    """It flies straight, turning steadily."""
     tau = seconds[:, None] / TRUE.readout_time
     return START * Rotation.from_rotvec(tau * OMEGA), START.apply(tau * V)
 

@@ -26,7 +26,6 @@ def turned(vector):
 
 
 def some_estimate(shaken=0, speed=0.2, acceleration=0.3):
-    """An estimate with a random covariance."""
     rng = np.random.default_rng(3)
     half = 1e-3 * rng.normal(size=(18 + 3 * shaken, 18 + 3 * shaken))
     half[18:] *= 0.1  # vibration makes ten times as much of the angular velocity

@@ -32,7 +32,6 @@ PARAMETER = re.compile(r"^ +(\w+): *[^#\n]*(?:# (.+))?$", re.MULTILINE)
 
 
 def documented(where: set[str]) -> Iterator[tuple[str, str, str]]:
-    """Page, name and default of every parameter in a table."""
     for table in pages.all_tables("parameter", "default"):
         if table.page in where:
             rows = zip(table.column("parameter"), table.column("default"), strict=True)
@@ -76,7 +75,6 @@ def test_the_node_and_the_help_begin_with_what_everybody_sets():
 
 
 def read(cell: str, like: Any) -> Any:
-    """A default as a table writes it."""
     said = re.sub(r": none$", "", cell).strip("`")
     if isinstance(like, bool):
         return {"true": True, "false": False}[said]
@@ -245,7 +243,6 @@ def test_the_words_below_the_picture_of_errors_are_its_medians():
 
 
 def section(anchor: str) -> str:
-    """The part of the page below a heading."""
     for part in re.split(r"^(?=##+ )", PAGE.read_text(encoding="utf-8"), flags=re.M):
         heading = re.sub(r"[^\w\- ]", "", part.partition("\n")[0].lstrip("# ").lower())
         if heading.replace(" ", "-") == anchor:

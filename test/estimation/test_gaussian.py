@@ -22,7 +22,6 @@ TURNS, MOVES = np.diag([0.05, 0.03, 0.02]), np.diag([0.001, 0.002, 0.02])
 
 
 def arched(found):
-    """The covariance of a mixture to second order."""
     return gaussian.along_arcs(found.covariance[:18, :18].copy(), found.state[9:12])
 
 

@@ -158,7 +158,6 @@ Recorded = tuple[CameraFrames, list[Localized], list[int]]
 
 @pytest.fixture(scope="module")
 def smoothed(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
-    """One second, localized."""
     path = tmp_path_factory.mktemp("smoothed") / "flight"
     words = "--trajectory tum_vi_room5 --start 20 --duration 1 --points 40 --outliers 0"
     assert main(["simulate", str(path), *words.split(), "--seed", "3"]) == 0

@@ -68,7 +68,6 @@ CAMERA_FROM_BASE = np.linalg.inv(BASE_FROM_MAST @ MAST_FROM_CAMERA_LINK @ CAMERA
 
 
 def tf(parent: str, child: str, pose: Array, seconds: float = 0.0) -> SimpleNamespace:
-    """A TFMessage with one transform."""
     transform = Transform(pose[:3, :3], pose[:3, 3])
     item = make_transform(make_message, round(seconds * 1e9), parent, child, transform)
     return SimpleNamespace(transforms=[item])
@@ -112,7 +111,6 @@ class Chain:
         return result
 
     def twist(self, motion: Motion, seconds: float) -> Array:
-        """Linear and angular velocity in body axes: the derivative of the body's pose."""
         step = 1e-5
         now = self.map_from_base(motion, seconds)
         before = self.map_from_base(motion, seconds - step)
@@ -122,7 +120,6 @@ class Chain:
         return np.concatenate([linear, angular])
 
     def pose_error(self, seconds: float, error: Array) -> Array:
-        """Displacement, and rotation about the fixed axes of the map."""
         right = self.map_from_base(self.motion, seconds)
         wrong = self.map_from_base(disturbed(self.motion, error), seconds)
         about = Rotation.from_matrix(wrong[:3, :3] @ right[:3, :3].T).as_rotvec()
@@ -148,8 +145,6 @@ class Panning(Chain):
 
 
 class KnowsTheMotion(Localizer):
-    """Stands in for the localizer."""
-
     def localize(self, *given: Any, **more: Any) -> Estimate:
         return replace(estimate(), span=self.camera.readout_time)
 

@@ -58,7 +58,6 @@ def refused(result: Localized | Refusal | None) -> tuple[str, str]:
 def simulated(
     direction: str = "top_to_bottom", motion: ConstantVelocity = FAST
 ) -> list[SimulatedFrame]:
-    """Without noise."""
     camera = replace(CAMERA, scan_direction=direction)
     world = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
     clean = FrameSettings(points=150, noise=0.0, outliers=0.0)

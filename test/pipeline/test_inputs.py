@@ -151,8 +151,6 @@ SECOND = 10**9
 
 
 class Heard:
-    """A stream, and what it told."""
-
     def __init__(self) -> None:
         self.told: list[tuple[str, str]] = []
         self.forget = Mock()

@@ -55,7 +55,6 @@ def shake(motion: Estimate, tau: float) -> Array:
 
 
 def pose(motion: Estimate, tau: float) -> tuple[Array, Array]:
-    """Rotation map_from_camera and camera centre."""
     angle = tau * motion.angular_velocity + 0.5 * tau**2 * motion.angular_acceleration
     way = tau * motion.linear_velocity + 0.5 * tau**2 * motion.linear_acceleration
     map_from_camera = motion.rotation.T
@@ -65,7 +64,6 @@ def pose(motion: Estimate, tau: float) -> tuple[Array, Array]:
 
 
 def pose_error(motion: Estimate, tau: float, error: Array) -> Array:
-    """Displacement, and rotation about fixed map axes, that an error brings."""
     rotation, position = pose(motion, tau)
     turned, moved = pose(disturbed(motion, error), tau)
     about_fixed_axes = Rotation.from_matrix(turned @ rotation.T).as_rotvec()

@@ -16,7 +16,6 @@ from .opposed_pair import PARTS, hand, record, rich
 
 
 def localize(path, **settings):
-    """Frames, refusals and notices of a recording."""
     values = load_params_file(path / "parameters.yaml") | {"min_inliers": 20} | settings
     notices: list[tuple[str, str]] = []
     with open_bag(path) as bag:
@@ -112,8 +111,6 @@ def test_a_wrong_extrinsic_is_named_and_no_pose_comes_of_it(tmp_path, degrees):
 
 
 class Watched:
-    """A pair, and what was said of it."""
-
     def __init__(self, window=0.02):
         self.said = []
         names = ("front", "rear")

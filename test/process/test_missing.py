@@ -74,7 +74,6 @@ def test_nodes_do_not_wait_for_packages_of_commands(tmp_path):
 
 
 def stopped(program: str, **variables: str) -> tuple[int, str, str]:
-    """Exit code, output and errors of a program."""
     environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
     done = subprocess.run(
         [sys.executable, "-c", program], env=environment | variables, text=True,
@@ -178,7 +177,6 @@ def plant(sent: Path, *names: str) -> None:
 
 
 def ran(sent: Path, *command: str, path: str = str(ROOT)) -> list[str]:
-    """Names of the modules that ran."""
     (sent.parent / "RAN").write_text("")
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONSAFEPATH"}
     subprocess.run(

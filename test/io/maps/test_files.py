@@ -69,7 +69,6 @@ def test_a_model_of_colmap(form, tmp_path):
 
 
 def model_with(path: Path, *changes: str) -> Path:
-    """A model whose database has been changed."""
     shutil.copytree(COLMAP / "binary", path, dirs_exist_ok=True)
     shutil.copy(COLMAP / "database.db", path)
     with sqlite3.connect(path / "database.db") as tables:
@@ -210,7 +209,6 @@ LARGEST = np.finfo(np.float32).max
 
 
 def descriptors(kind: str, width: int) -> Any:
-    """Random ones with values that are anything."""
     if kind == "none":
         return None
     values = (200 * np.random.default_rng(width).random((COUNT, width))).astype(kind)
