@@ -1,6 +1,9 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bundled webcam recording: does a real shutter do what the model says, sign and all?"""
+"""Bundled recordings of a webcam, a phone and a global shutter, against what judges them."""
+
+from itertools import pairwise
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,10 +12,13 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import rs_localizer as rsl
+from benchmarks.data import GLOBAL_SHUTTER_TAGS, PHONE, PHONE_GYROSCOPE
 from benchmarks.frames.conditions import REST, TRACKED, Condition
 from benchmarks.frames.judged import judge
 from benchmarks.independent.scenes import Rich
 from rs_localizer import data
+from rs_localizer.cli.commands import main
+from rs_localizer.config import NodeConfig
 from rs_localizer.core.rig import Mounts
 from rs_localizer.estimation.points import Observations
 from rs_localizer.estimation.prior import state_in
@@ -20,7 +26,13 @@ from rs_localizer.estimation.projection import linearized
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
+from rs_localizer.io.trajectories import read_twists
+from rs_localizer.offline.replay import find_topics, replay
+from rs_localizer.pipeline.camera_frames import CameraFrames
+from rs_localizer.pipeline.pose_at_time import twist_at
 from rs_localizer.tracking import Tracker
+
+from .moving import squared
 
 # 0.33 of the assumed frame time; the video has no time stamps.
 READOUT = 0.33 / 30
@@ -30,7 +42,6 @@ NEIGHBOURS = 0.09  # s between the frames before and after, none left out
 
 @pytest.fixture(scope="module")
 def recording():
-    """Calibration and clouds."""
     clouds, calibration = [], None
     with open_bag(data.path("webcam_chessboard/recording")) as bag:
         for topic, _, message in bag.messages(("/camera_info", "/correspondences")):
@@ -122,3 +133,100 @@ def test_at_rest_a_tracked_twist_is_none():
     assert rest.localized.all()
     assert np.median(rest.of("deg/s")) < 0.6
     assert rest.of("deg/s").max() < 1.0
+
+
+READOUT_TIME = 0.0318
+IMAGES, PERIOD = 40, 1.0 / 30.02
+
+
+def gyroscope_at(middle_rows):
+    """Mean turn rates (n,3), deg/s, of images with these middle rows (n,), s."""
+    table = np.loadtxt(PHONE_GYROSCOPE)
+    during = np.abs(table[:, 0] - middle_rows[:, None]) < 0.5 * READOUT_TIME
+    assert during.sum(axis=1).min() >= 12  # 412 Hz
+    return np.rad2deg(during @ table[:, 1:] / during.sum(axis=1)[:, None])
+
+
+def errors_of(found, shift=0.0):
+    """Of rates (n,3) at times (n,), deg/s, before the gyroscope so much later."""
+    times, rates = found
+    return np.linalg.norm(rates - gyroscope_at(times + shift), axis=1)
+
+
+def twists(out: Path, *settings):
+    """Times (n,) s and turn rates (n,3) deg/s that ``replay`` writes."""
+    assigned = [word for each in ("pose_time:=mid_frame", *settings) for word in ("-p", each)]
+    parameters = str(PHONE / "parameters.yaml")
+    assert main(["replay", str(PHONE), "--params", parameters, *assigned, "--out", str(out)]) == 0
+    found = read_twists(out / "twists.txt")
+    return 1e-9 * found.stamps_ns, np.rad2deg(found.angular)
+
+
+def slopes(found, truth):
+    """What the truth is multiplied with to give the rates about each axis (3,)."""
+    return np.sum(found * truth, axis=0) / np.sum(truth**2, axis=0)
+
+
+@pytest.fixture(scope="module")
+def at_once(tmp_path_factory):
+    return twists(tmp_path_factory.mktemp("phone") / "out")
+
+
+def test_tracked_twists_are_those_of_the_gyroscope(at_once):
+    times, _ = at_once
+    assert len(times) == IMAGES - 1  # no frame before the first one tells its twist
+    assert np.linalg.norm(gyroscope_at(times), axis=1).max() > 30.0  # there is something to tell
+    assert np.median(errors_of(at_once)) < 3.5
+    assert np.percentile(errors_of(at_once), 95) < 10.0
+
+
+def test_one_image_later_they_are_twice_as_near(tmp_path, at_once):
+    times, rates = later = twists(tmp_path / "out", "output_lag:=1")
+    # The scale, and all of z, depend on the focal length, which the clip hardly tells.
+    assert np.all(np.abs(slopes(rates, gyroscope_at(times)) - 1.0) < [0.2, 0.2, 0.4])
+    assert np.median(errors_of(later)) < 0.6 * np.median(errors_of(at_once))
+
+
+def test_stamps_of_another_image_and_a_reversed_shutter_are_told(tmp_path, at_once):
+    """What the first test would miss if it could not fail."""
+    for shift in (-PERIOD, PERIOD):
+        assert np.median(errors_of(at_once, shift)) > 1.5 * np.median(errors_of(at_once))
+    times, rates = twists(tmp_path / "out", "scan_direction:=bottom_to_top", "tracking:=false")
+    assert slopes(rates, gyroscope_at(times))[0] < -0.5
+
+
+# Of 6 dimensions: what 95 % of a chi-squared variable lie below.
+REGION = 12.59
+
+
+def replayed(count, **settings):
+    """What the node would publish, a pose of each of so many frames, and what it would say."""
+    notices = list[str]()
+    localizer = CameraFrames(NodeConfig(**settings), lambda _, text: notices.append(text))
+    with open_bag(GLOBAL_SHUTTER_TAGS) as bag:
+        answers = replay(bag, find_topics(bag), localizer)
+        frames = [found for _, (*_, found) in zip(range(count), answers, strict=False)]
+    assert all(frames)
+    return frames, notices
+
+
+def jitter(frames):
+    """Second differences of the orientation (deg)."""
+    poses = [Rotation.from_matrix(frame.pose.rotation) for frame in frames]
+    turns = [(a.inv() * b).as_rotvec() for a, b in pairwise(poses)]
+    return np.degrees(np.linalg.norm(np.diff(turns, axis=0), axis=1))
+
+
+def test_a_global_shutter_stays_one():
+    frames, notices = replayed(100, readout_time=0.02)
+    assert any("(a global shutter)" in text for text in notices)
+    own, p3p = jitter(frames), jitter(replayed(100, solver="p3p")[0])
+    # Frame by frame: medians of the same poses differ by a twentieth by chance.
+    assert np.median(own / p3p) <= 1.05
+    assert np.quantile(own, 0.95) <= 1.05 * np.quantile(p3p, 0.95)
+    still = []
+    for frame in frames:
+        twist = twist_at(frame.estimate, 0.0, 1.0)  # per readout
+        velocities = np.concatenate([twist.linear, twist.angular])
+        still.append(not velocities.any() or squared(velocities, twist.covariance) < REGION)
+    assert np.mean(still) >= 0.99

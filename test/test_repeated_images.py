@@ -55,7 +55,6 @@ def results(tracker, times, frames):
 
 @pytest.fixture(scope="module")
 def held():
-    """Frames of a hand."""
     times = np.arange(60) / 20.0
     return times, [frame(HAND, t, 0.3, k) for k, t in enumerate(times)]
 

@@ -562,26 +562,19 @@ def jolted(seed: int, degrees: float) -> Moving:
     return Moving(way)
 
 
-@pytest.mark.parametrize("seed", [5, 12, 21])
-def test_no_pose_goes_out_that_the_points_of_its_frame_deny(seed):
-    """Frames before the jolt predict another motion than its own points tell."""
-    moving, points = jolted(seed, 4.0), np.random.default_rng(5).uniform(-6.0, 6.0, (3000, 3))
+@pytest.mark.parametrize(
+    ("degrees", "seed"), [(4.0, 5), (4.0, 12), (4.0, 21), (1.0, 1), (1.0, 12), (1.0, 15), (1.0, 16)]
+)
+def test_after_a_jolt_the_points_of_a_frame_say_how_it_moves(degrees, seed):
+    """Frames before it predict another motion; a small one is no error of the lens."""
+    moving, points = jolted(seed, degrees), np.random.default_rng(5).uniform(-6.0, 6.0, (3000, 3))
+    part = slice(0, 6) if degrees > 1.0 else slice(6, 12)  # poses; or twists, of all frames
     for t, result in followed(times(27), 80, points, moving, noise=0.5):
-        if result and t > 0.6:
-            error = moving.error(result, t)[:6]
-            assert error @ np.linalg.solve(result.covariance[:6, :6], error) < FAR
-            assert np.count_nonzero(result.inliers) > 40
-
-
-@pytest.mark.parametrize("seed", [1, 12, 15, 16])
-def test_a_jolt_at_rest_is_no_error_of_the_lens(seed):
-    """However calm the camera was, it may move as the settings say."""
-    moving, points = jolted(seed, 1.0), np.random.default_rng(5).uniform(-6.0, 6.0, (3000, 3))
-    for t, result in followed(times(27), 80, points, moving, noise=0.5):
-        if t > 0.6:
+        if t > 0.6 and (result or degrees == 1.0):
             assert result, str(result)
-            error, covariance = moving.error(result, t)[6:], result.covariance[6:12, 6:12]
-            assert error @ np.linalg.solve(covariance, error) < FAR
+            error = moving.error(result, t)[part]
+            assert error @ np.linalg.solve(result.covariance[part, part], error) < FAR
+            assert degrees == 1.0 or np.count_nonzero(result.inliers) > 40
 
 
 def test_what_creeps_away_does_not_take_the_camera_along():

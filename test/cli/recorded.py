@@ -44,19 +44,16 @@ def record(*words: object) -> None:
 
 
 def tf(parent: str, child: str, position: Any, turn: Rotation, stamp_ns: int = 0) -> Any:
-    """A TFMessage of one transform."""
     pose = Transform(turn.as_matrix(), np.array(position, float))
     stamped = make_transform(make_message, stamp_ns, parent, child, pose)
     return make_message("tf2_msgs/msg/TFMessage", transforms=[stamped])
 
 
 def imu(stamp_ns: int, rate: Any = (0.0, 0.0, 0.0)) -> Any:
-    """A reading of an IMU that is held level."""
     return make_reading(stamp_ns, np.array(rate), np.array([0.0, 0.0, 9.81]), "imu")
 
 
 def write_mp4(path: Path, images: Iterable[Any], rate: float) -> Path:
-    """Grey images as a video."""
     writer: Any = None
     for image in images:
         if writer is None:

@@ -44,14 +44,12 @@ def seen(prints: Any, x: float) -> Any:
 
 
 def board(columns: int = 6, rows: int = 4, x: float = 0.0) -> Any:
-    """A chessboard by its inner corners."""
     width, height = columns + 1, rows + 1
     outline = rectangle(SQUARE * width, SQUARE * height)
     return seen([(chessboard_cells(width, height), outline)], x)
 
 
 def markers(x: float = 0.0) -> Any:
-    """Both markers of the map."""
     return seen([(pattern(m.family, m.id), m.corners) for m in MARKERS.markers], x)
 
 

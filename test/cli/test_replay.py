@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``rs_localizer replay``: three kinds of recordings in, poses and twists out, faults in a line."""
+"""``rs_localizer replay`` of matches, images and keypoints: poses and twists, faults in a line."""
 
 import dataclasses
 import weakref
@@ -10,18 +10,30 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recorded import CAMERA, READOUT_TIME, SHUTTER, flight, tf, write_ros1
+import recorded
+from numpy.lib.recfunctions import repack_fields
+from recorded import CAMERA, READOUT_TIME, SHUTTER, flight, record, tf, write_mp4, write_ros1
 from scipy.spatial.transform import Rotation
 
+from benchmarks.fuzzing import map_rows
 from rs_localizer.cli.commands import main
-from rs_localizer.io.bags import STORAGES, BagWriter, open_bag
+from rs_localizer.io.bags import STORAGES, BagWriter, make_message, open_bag
+from rs_localizer.io.camera_files import write_calibration
+from rs_localizer.io.camera_info import read_camera_info
+from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.images import decode_image
+from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized
 from rs_localizer.io.trajectories import read_motions, read_tum, read_twists
 from rs_localizer.offline import results
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import FrameSettings
-from rs_localizer.tools.simulation.simulated_recording import write_simulated
+from rs_localizer.tools.simulation.simulated_recording import (
+    keypoint_rows,
+    random_descriptors,
+    write_simulated,
+)
 
 FRAMES = 6
 # Nanoseconds since 1970 that a float of seconds cannot hold.
@@ -177,3 +189,105 @@ def test_frames_are_written_as_they_come_and_let_go(recording, tmp_path, monkeyp
     assert main(["replay", str(recording), "--out", str(tmp_path / "out"), *SHUTTER]) == 0
     assert len(read_tum(tmp_path / "out" / "poses.txt")) == 300
     assert most < 10
+
+
+READOUT = 0.02
+
+
+@pytest.fixture(scope="module")
+def walls(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag of images, and beside it the same as a video with its calibration."""
+    path = tmp_path_factory.mktemp("images") / "walls"
+    words = ["--images", "--duration", "0.4", "--readout-time", str(READOUT)]
+    assert main(["simulate", str(path), *words, "--trajectory", "tum_vi_room5"]) == 0
+    with open_bag(path) as bag:
+        (topic,) = (t for t, kind in bag.topics.items() if kind.endswith("Image"))
+        images = [decode_image(bytes(m.data), m.format) for _, _, m in bag.messages([topic])]
+        (info,) = (t for t, kind in bag.topics.items() if kind.endswith("CameraInfo"))
+        camera = read_camera_info(next(m for _, _, m in bag.messages([info]))).camera(
+            0.0, "top_to_bottom"
+        )
+    write_mp4(path.parent / "walls.mp4", images, 30.0)
+    write_calibration(path.parent / "camera.yaml", camera)
+    return path
+
+
+@pytest.mark.parametrize("kind", ["bag", "video"])
+def test_poses_are_those_of_detect_and_replay(kind: str, walls: Path, tmp_path: Path) -> None:
+    folder = walls.parent
+    source = [str(walls)]
+    if kind == "video":
+        source = [str(folder / "walls.mp4"), "--calibration", str(folder / "camera.yaml")]
+    given = [*source, "--map", str(walls / "marker_map.yaml"), "-p", f"readout_time:={READOUT}"]
+    more = ["-p", "inlier_threshold:=2.5", "--smooth"]
+    seen, steps, once = tmp_path / "seen", tmp_path / "steps", tmp_path / "once"
+    assert main(["detect", *given, "--images", "--out", str(seen)]) == 0
+    shutter = ["--params", str(seen / "parameters.yaml"), *more]
+    assert main(["replay", str(seen), *shutter, "--out", str(steps)]) == 0
+    assert main(["replay", *given, *more, "--out", str(once)]) == 0
+    for name in ("poses.txt", "twists.txt"):
+        rows = [np.loadtxt(place / name) for place in (steps, once)]
+        assert len(rows[0]) > 5
+        np.testing.assert_array_equal(*rows)
+
+
+def test_what_is_missing_is_said(walls: Path, tmp_path: Path, capsys: Any) -> None:
+    words = ["replay", str(walls.parent / "walls.mp4"), "--out", str(tmp_path / "out"), "--map"]
+    assert main([*words, str(walls / "marker_map.yaml")]) == 2
+    assert "a video or folder has no camera_info: give --camera" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    assert main(["replay", str(walls.parent / "walls.mp4")]) == 1
+    assert "walls.mp4 is a video, not matches: give --map, of markers" in capsys.readouterr().err
+
+
+COUNT = 8
+POINTS = room(np.zeros((1, 3)), np.random.default_rng(0), count=6000)
+LANDMARKS = Map(
+    POINTS, np.arange(6000) + 7, random_descriptors(6000, np.random.default_rng(1)), "map"
+)
+
+
+def test_a_recording_of_everything(tmp_path, capsys, ran):
+    """By the id or by the points themselves: the frames since the map came are the same."""
+    seen = FrameSettings(points=80, noise=0.5, outliers=0.2)
+    with BagWriter(tmp_path / "all") as bag:
+        for frame in recorded.flight(POINTS, COUNT, seen, 10**9):
+            write_simulated(bag, recorded.CAMERA, frame)
+            rows = keypoint_rows(frame, LANDMARKS, np.random.default_rng(frame.stamp_ns))
+            for topic, names in {
+                "/cam/keypoints": ["u", "v", "descriptor"], "/ids": ["u", "v", "id"],
+            }.items():  # fmt: skip
+                message = make_cloud(
+                    make_message, frame.stamp_ns, "camera", repack_fields(rows[names])
+                )
+                bag.write(topic, message, frame.stamp_ns)
+            if frame.stamp_ns == 10**9 + 66_666_667:  # late: with the third frame
+                message = make_cloud(make_message, 0, "map", map_rows(LANDMARKS))
+                bag.write("/cam/map_points", message, frame.stamp_ns - 1)
+    words = ["replay", str(tmp_path / "all"), *SHUTTER]
+    assert "choose with -r correspondences:=TOPIC or -r keypoints:=TOPIC" in ran(*words, code=1).err
+    found = {}
+    for name, given in {
+        "clouds": ["-r", "correspondences:=/correspondences"],
+        "ids": ["-r", "keypoints:=/ids", "-r", "map_points:=/cam/map_points"],
+        "descriptors": ["-r", "keypoints:=cam/keypoints"],
+    }.items():
+        assert main([*words, *given, "--out", str(tmp_path / name)]) == 0
+        found[name] = read_tum(tmp_path / name / "poses.txt").positions
+    assert "map_replaced" not in capsys.readouterr().out
+    assert len(found["clouds"]) == COUNT
+    for name in ("ids", "descriptors"):
+        np.testing.assert_allclose(found[name], found["clouds"][2:], atol=0.01)
+
+
+def test_a_recording_beside_its_map(tmp_path, ran):
+    flight, out = tmp_path / "flight", tmp_path / "poses"
+    record(flight, "--keypoints", "--duration", "0.4", "--points", "200")
+    words = ["--params", f"{flight}/parameters.yaml", "--map", f"{flight}/map.npz"]
+    assert "and no map; give one with --map" in ran("replay", flight, *words[:2], code=1).err
+    assert main(["replay", str(flight), *words, "--out", str(out)]) == 0
+    found = read_tum(out / "poses.txt")
+    truth = read_motions(flight, "/truth/pose", "/truth/twist").poses
+    assert len(found) == 12
+    off = found.positions - truth.positions[np.isin(truth.stamps_ns, found.stamps_ns)]
+    assert np.median(np.linalg.norm(off, axis=1)) < 0.02

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from rs_localizer.core.reasons import Reason
-from rs_localizer.core.shake import FUNCTIONS
-from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.core.types import Failure
 
-from ..pipeline.motions import disturbed  # noqa: TID252 - Python has a package "test"
+from ..moving import estimate_at  # noqa: TID252 - Python has a package "test"
+from ..pipeline.motions import disturbed  # noqa: TID252
 
 SPAN = 0.03
 TAU = np.linspace(-0.8, 0.8, 33)
@@ -26,21 +26,18 @@ def turned(vector):
 
 
 def some_estimate(shaken=0, speed=0.2, acceleration=0.3):
-    """An estimate with a random covariance."""
     rng = np.random.default_rng(3)
     half = 1e-3 * rng.normal(size=(18 + 3 * shaken, 18 + 3 * shaken))
     half[18:] *= 0.1  # vibration makes ten times as much of the angular velocity
-    shake = np.zeros((0, 3))
-    if shaken:
-        shake = np.zeros((FUNCTIONS, 3))
-        shake[:shaken] = 0.01 * rng.normal(size=(shaken, 3))
-    return Estimate(
+    shake = 0.01 * rng.normal(size=(shaken, 3))
+    motion = rsl.Motion(
         turned(rng.normal(size=3)), np.array([0.1, -0.2, 3.0]), *(speed * rng.normal(size=(2, 3))),
         angular_acceleration=acceleration * rng.normal(size=3),
         linear_acceleration=acceleration * rng.normal(size=3),
-        inliers=np.array([True, False, True]), residuals=np.array([3.0, np.nan, 4.0]),
-        joint_covariance=half @ half.T, iterations=0,
-        shake=shake[:shaken], span=SPAN, time_ns=10**12,
+    )  # fmt: skip
+    return estimate_at(
+        motion, inliers=np.array([True, False, True]), residuals=np.array([3.0, np.nan, 4.0]),
+        joint_covariance=half @ half.T, shake=shake, span=SPAN, time_ns=10**12,
     )  # fmt: skip
 
 

@@ -18,8 +18,6 @@ _INDENTED = re.compile(r"(?:^|\n)\n((?:(?: {4}|\t)[^\n]*\n|\n)+)")
 
 
 class Table(NamedTuple):
-    """A table of a page."""
-
     page: str
     columns: list[str]
     rows: list[list[str]]
@@ -33,12 +31,10 @@ def text(page: str) -> str:
 
 
 def fenced(page: str, language: str) -> list[str]:
-    """Blocks of code between fences."""
     return [code for kind, code in _FENCE.findall(text(page)) if kind == language]
 
 
 def prose(page: str) -> str:
-    """Without the code."""
     without = _FENCE.sub("", text(page))
     return re.sub(r"^ {4}.*$", "", without, flags=re.MULTILINE)
 
@@ -59,7 +55,6 @@ def anchors(page: str) -> set[str]:
 
 
 def links(page: str) -> list[str]:
-    """Targets of links and pictures."""
     return re.findall(r"\]\(([^)\s]+)\)", prose(page))
 
 
@@ -76,13 +71,11 @@ def tables(page: str) -> Iterator[Table]:
 
 
 def all_tables(*columns: str) -> list[Table]:
-    """Tables of all pages that have these columns."""
     found = [table for page in NAMES for table in tables(page)]
     return [table for table in found if set(columns) <= set(table.columns)]
 
 
 def names_in(cell: str) -> list[str]:
-    """What stands between backticks."""
     return re.findall(r"`([^`]+)`", cell)
 
 

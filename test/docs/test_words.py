@@ -42,7 +42,6 @@ VAGUE = re.compile(r"(The same|That|Those|These|This|What|With|Such|Likewise|As)
 
 
 def documented(module: str) -> Iterator[tuple[ast.AST, str, str]]:
-    """Node, name and docstring of everything in a module that has one."""
     tree = ast.parse((PACKAGE / module).read_text(encoding="utf-8"))
     for node in ast.walk(tree):
         if isinstance(node, DOCUMENTED) and (said := ast.get_docstring(node)):

@@ -47,7 +47,6 @@ def observe(state, points, noise, seed, swing=steady, seen_as=None):
 
 
 def frame(seed, speed, noise, count=60, acceleration=0.0, **more):
-    """Observations of a box of points, and the state that sees it."""
     rng = np.random.default_rng(seed)
     state, points = box(seed, speed, count, acceleration, rng)
     return observe(state, points, noise, rng, **more), state
@@ -65,7 +64,6 @@ def changed(observations, points=None, gradient=None, rounded=0.0):
 
 
 def fitted(observations, start, prior, threshold):
-    """The best motion near a state (24,)."""
     return Posterior(*best_motion(observations.packed, len(observations), start, prior, threshold))
 
 

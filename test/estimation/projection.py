@@ -29,7 +29,6 @@ def disturbed(state, step):
 
 
 def pixels_of(rays):
-    """Distorted pixels (n,2) of rays (n,2)."""
     bent = rays * (1.0 + RADIAL * np.sum(rays**2, axis=1, keepdims=True))
     return np.column_stack([bent, np.ones(len(rays))]) @ MATRIX.T
 

@@ -35,7 +35,6 @@ def results(scene, fault):
 
 
 def turned(result, rotation):
-    """Squared error of the orientation in deviations."""
     off = error_of(result, replace(AT_REST, rotation=rotation))[:3]
     return squared(off, result.covariance)
 

@@ -46,7 +46,6 @@ def problem(outlier_share):
 
 
 def run(observations, solver, *pools):
-    """The search by pools of equal shares."""
     mock = replace(find_solver("r6p_vcwt"), solve=solver)
     hypotheses = search.Hypotheses(mock, 50, 2000, 8.0, 2.0, 1.0, 5, 0.99)
     alike = [search.Pool.of(points, 1.0, 0) for points in pools]

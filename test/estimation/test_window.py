@@ -64,7 +64,6 @@ def simulated(deviations, count, rng, state=None):
 
 
 def samples_of(path, rng, first=0):
-    """What frames see of it."""
     found = []
     for k, truth in enumerate(path):
         seen = np.append(truth[:12] + NOISE * rng.normal(size=12), np.zeros(6))

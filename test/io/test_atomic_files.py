@@ -103,7 +103,6 @@ def make(folder: Path, files: dict[str, str]) -> None:
 
 
 def tree(folder: Path) -> dict[str, str]:
-    """All files, those of workplaces included."""
     files = [path for path in folder.rglob("*") if path.is_file()]
     return {str(path.relative_to(folder)): path.read_text() for path in files}
 

@@ -18,7 +18,6 @@ NO_TURN = (0.0, 0.0, 0.0, 1.0)
 
 
 def tf(parent: str, child: str, t: Numbers, q: Numbers, stamp_ns: int = 0) -> Made:
-    """A TFMessage of one transform."""
     place, turn = (Made(**dict(zip("xyzw", values, strict=False))) for values in (t, q))
     header = make_header(lambda _, **fields: Made(**fields), stamp_ns, parent)
     transform = Made(translation=place, rotation=turn)

@@ -26,7 +26,6 @@ def look(
 
 
 def project(points: Array, pose: tuple[Array, Array]) -> Array:
-    """Pixels (n,2) of points (n,3)."""
     rotation, translation = pose
     seen = (points @ rotation.T + translation) @ K.T
     return seen[:, :2] / seen[:, 2:]

@@ -34,7 +34,6 @@ DETERMINED = {
 
 
 def leaves(value):
-    """All arrays and numbers in a result, in order."""
     if isinstance(value, tuple):
         return [leaf for part in value for leaf in leaves(part)]
     return [] if value is None else [np.asarray(value)]

@@ -19,7 +19,6 @@ _kept = {}
 
 
 def size(value):
-    """Bytes of all arrays in a value."""
     if isinstance(value, tuple):
         return sum(map(size, value))
     return getattr(value, "nbytes", 0)

@@ -137,7 +137,6 @@ def squared(errors: Array, covariances: Array) -> float:
 
 
 def turns(found: Any, true: Any) -> Array:
-    """Rotation vectors about the fixed axes."""
     vectors: Array = (Rotation.from_matrix(found) * Rotation.from_matrix(true).inv()).as_rotvec()
     return vectors
 

@@ -53,13 +53,10 @@ def hand(begin: float, seconds: float) -> TrueMotion:
 
 @dataclass(frozen=True)
 class Part:
-    """Of a motion, what lies in some intervals."""
-
     motion: TrueMotion
     intervals_ns: list[tuple[int, int]]
 
     def state(self, stamp_ns: int, offsets: Any) -> Any:
-        """Of the whole."""
         return self.motion.state(stamp_ns, offsets)
 
 

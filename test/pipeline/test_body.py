@@ -40,6 +40,7 @@ from rs_localizer.pipeline.map_to_odom import CorrectionState
 from rs_localizer.pipeline.published import Broadcast, broadcast
 from rs_localizer.pipeline.refusal import Refusal
 
+from ..moving import estimate_at  # noqa: TID252 - Python has a package "test"
 from .motions import covariance_of, disturbed
 
 READOUT_TIME = 0.03
@@ -67,7 +68,6 @@ CAMERA_FROM_BASE = np.linalg.inv(BASE_FROM_MAST @ MAST_FROM_CAMERA_LINK @ CAMERA
 
 
 def tf(parent: str, child: str, pose: Array, seconds: float = 0.0) -> SimpleNamespace:
-    """A TFMessage with one transform."""
     transform = Transform(pose[:3, :3], pose[:3, 3])
     item = make_transform(make_message, round(seconds * 1e9), parent, child, transform)
     return SimpleNamespace(transforms=[item])
@@ -86,17 +86,11 @@ def estimate() -> Estimate:
     rng = np.random.default_rng(0)
     deviations = np.repeat([0.003, 0.01, 0.02, 0.05, 0.01, 0.02], 3)
     root = rng.normal(size=(18, 18)) * deviations[:, None]
-    return Estimate(
-        rotation=Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(),
-        translation=np.array([0.1, -0.2, 2.0]),
-        angular_velocity=np.array([0.05, -0.1, 0.2]),
-        linear_velocity=np.array([0.02, 0.05, -0.01]),
-        inliers=np.ones(8, dtype=bool),
-        residuals=np.ones(8),
-        joint_covariance=root @ root.T,
-        iterations=10,
-        span=READOUT_TIME,
-    )
+    motion = Motion(
+        Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(), np.array([0.1, -0.2, 2.0]),
+        np.array([0.05, -0.1, 0.2]), np.array([0.02, 0.05, -0.01]),
+    )  # fmt: skip
+    return estimate_at(motion, 8, joint_covariance=root @ root.T, span=READOUT_TIME)
 
 
 class Chain:
@@ -117,7 +111,6 @@ class Chain:
         return result
 
     def twist(self, motion: Motion, seconds: float) -> Array:
-        """Linear and angular velocity in body axes: the derivative of the body's pose."""
         step = 1e-5
         now = self.map_from_base(motion, seconds)
         before = self.map_from_base(motion, seconds - step)
@@ -127,7 +120,6 @@ class Chain:
         return np.concatenate([linear, angular])
 
     def pose_error(self, seconds: float, error: Array) -> Array:
-        """Displacement, and rotation about the fixed axes of the map."""
         right = self.map_from_base(self.motion, seconds)
         wrong = self.map_from_base(disturbed(self.motion, error), seconds)
         about = Rotation.from_matrix(wrong[:3, :3] @ right[:3, :3].T).as_rotvec()
@@ -153,8 +145,6 @@ class Panning(Chain):
 
 
 class KnowsTheMotion(Localizer):
-    """Stands in for the localizer."""
-
     def localize(self, *given: Any, **more: Any) -> Estimate:
         return replace(estimate(), span=self.camera.readout_time)
 

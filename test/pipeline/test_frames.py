@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From message to pose: refusals and their reasons, times, changes of camera and settings."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -37,6 +38,8 @@ from rs_localizer.tools.simulation.true_motion import (
 from .clouds import cloud_of
 
 READOUT_TIME = 0.03
+K = np.array([[500.0, 0.0, 319.5], [0.0, 510.0, 239.5], [0.0, 0.0, 1.0]])
+CAMERA = Camera(640, 480, K, readout_time=READOUT_TIME)
 FAST = ConstantVelocity(np.array([1.0, -2.0, 3.0]), np.array([1.0, 0.5, -1.5]), 0.3)
 STILL = ConstantVelocity(np.zeros(3), np.zeros(3), 0.1)
 
@@ -55,9 +58,7 @@ def refused(result: Localized | Refusal | None) -> tuple[str, str]:
 def simulated(
     direction: str = "top_to_bottom", motion: ConstantVelocity = FAST
 ) -> list[SimulatedFrame]:
-    """Without noise."""
-    K = np.array([[500.0, 0.0, 319.5], [0.0, 510.0, 239.5], [0.0, 0.0, 1.0]])
-    camera = Camera(640, 480, K, readout_time=READOUT_TIME, scan_direction=direction)
+    camera = replace(CAMERA, scan_direction=direction)
     world = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
     clean = FrameSettings(points=150, noise=0.0, outliers=0.0)
     return list(simulate_frames(camera, motion, world, clean))[1:]  # a stamp of 0 is none
@@ -65,6 +66,20 @@ def simulated(
 
 def message_of(frame: SimulatedFrame) -> Any:
     return cloud_of(frame.stamp_ns, frame.points, frame.pixels)
+
+
+@pytest.fixture
+def begin(make_camera_info) -> Callable[..., tuple[CameraFrames, list[tuple[str, str]]]]:
+    """Frames of a calibrated camera, and the notices that they give."""
+
+    def begin(**settings: Any) -> tuple[CameraFrames, list[tuple[str, str]]]:
+        notices: list[tuple[str, str]] = []
+        config = NodeConfig(**{"readout_time": READOUT_TIME} | settings)
+        frames = CameraFrames(config, lambda *words: notices.append(words))
+        frames.calibrate(read_camera_info(make_camera_info()))
+        return frames, notices
+
+    return begin
 
 
 def test_reasons_of_refusals(make_camera_info):
@@ -90,12 +105,10 @@ def test_reasons_of_refusals(make_camera_info):
     assert localized(frames.localize(next(messages))).body_frame == "camera"
 
 
-def test_inliers_are_the_rows_that_were_kept(make_camera_info):
+def test_inliers_are_the_rows_that_were_kept(begin):
     seen = simulated()[0]
     seen.points[0, 1] = seen.pixels[3, 1] = np.nan
-    frames = CameraFrames(NodeConfig(readout_time=READOUT_TIME))
-    frames.calibrate(read_camera_info(make_camera_info()))
-    frame = localized(frames.localize(message_of(seen)))
+    frame = localized(begin()[0].localize(message_of(seen)))
     assert frame.dropped == 2
     kept = np.delete(seen.points, [0, 3], axis=0)[frame.estimate.inliers]
     np.testing.assert_array_equal([frame.inliers[name] for name in "xyz"], kept.T)
@@ -104,9 +117,8 @@ def test_inliers_are_the_rows_that_were_kept(make_camera_info):
 
 
 @pytest.mark.parametrize("pose_time", list(PoseTime))
-def test_without_a_readout_time_there_is_a_pose_but_no_twist(make_camera_info, pose_time):
-    frames = CameraFrames(NodeConfig(stamp_offset=0.5, pose_time=pose_time))
-    frames.calibrate(read_camera_info(make_camera_info()))
+def test_without_a_readout_time_there_is_a_pose_but_no_twist(begin, pose_time):
+    frames, _ = begin(readout_time=0.0, stamp_offset=0.5, pose_time=pose_time)
     seen = simulated(motion=STILL)[0]
     frame = localized(frames.localize(message_of(seen)))
     assert frame.twist is None
@@ -117,11 +129,8 @@ def test_without_a_readout_time_there_is_a_pose_but_no_twist(make_camera_info, p
 
 
 @pytest.mark.parametrize(("bend", "told"), [(0.0, set()), (4.0, {"lens"})])
-def test_a_lens_that_is_off_is_noticed_after_half_a_second(make_camera_info, bend, told):
-    notices: list[tuple[str, str]] = []
-    config = NodeConfig(readout_time=READOUT_TIME)
-    frames = CameraFrames(config, lambda *words: notices.append(words))
-    frames.calibrate(read_camera_info(make_camera_info()))
+def test_a_lens_that_is_off_is_noticed_after_half_a_second(begin, bend, told):
+    frames, notices = begin()
     seen, rng = simulated(motion=STILL)[0], np.random.default_rng(1)
     away = (seen.pixels - [319.5, 239.5]) / 500.0
     bent = seen.pixels + bend * (away**2).sum(axis=1)[:, None] * away  # px
@@ -135,20 +144,14 @@ def test_a_lens_that_is_off_is_noticed_after_half_a_second(make_camera_info, ben
 
 
 @pytest.mark.parametrize(("unit", "told"), [(1.0, ""), (1000.0, "millimetres"), (100.0, "centi")])
-def test_the_unit_of_a_map_is_named_before_its_lens(make_camera_info, unit, told):
+def test_the_unit_of_a_map_is_named_before_its_lens(begin, unit, told):
     """By a hand: priors hold tracked poses back, and what that leaves looks like a wrong lens."""
-    notices: list[tuple[str, str]] = []
-    frames = CameraFrames(
-        NodeConfig(readout_time=READOUT_TIME), lambda *words: notices.append(words)
-    )
-    frames.calibrate(read_camera_info(make_camera_info()))
+    frames, notices = begin()
     motion = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
     world = room(sampled_states(motion).positions, np.random.default_rng(0), count=3000)
     stamps = [motion.intervals_ns[0][0] + round(5e9 + k * 1e9 / 30) for k in range(40)]
-    K = np.array([[500.0, 0.0, 319.5], [0.0, 510.0, 239.5], [0.0, 0.0, 1.0]])
-    camera = Camera(640, 480, K, readout_time=READOUT_TIME)
     seen = FrameSettings(points=80, noise=0.5, outliers=0.0)
-    for frame in simulate_frames(camera, motion, world, seen, stamps_ns=stamps):
+    for frame in simulate_frames(CAMERA, motion, world, seen, stamps_ns=stamps):
         frames.localize(cloud_of(frame.stamp_ns, unit * frame.points, frame.pixels))
     named = {name for name, _ in notices}
     assert ("map_scale" in named) == bool(told)
@@ -156,13 +159,10 @@ def test_the_unit_of_a_map_is_named_before_its_lens(make_camera_info, unit, told
     assert all(f"is the map in {told}" in text for name, text in notices if name == "map_scale")
 
 
-def test_a_new_camera_counts_from_the_next_frame_on(make_camera_info):
-    notices: list[tuple[str, str]] = []
-    settings = {"readout_time": READOUT_TIME, "scan_direction": "left_to_right"}
-    frames = CameraFrames(NodeConfig(**settings), lambda *words: notices.append(words))
+def test_a_new_camera_counts_from_the_next_frame_on(begin, make_camera_info):
+    frames, notices = begin(scan_direction="left_to_right")
     messages = map(message_of, simulated("left_to_right"))
-    for _ in range(2):  # the same again
-        frames.calibrate(read_camera_info(make_camera_info()))
+    frames.calibrate(read_camera_info(make_camera_info()))  # the same again
     assert localized(frames.localize(next(messages))).body_frame == "camera"
     assert notices == []
     other = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="right_eye")
@@ -205,11 +205,10 @@ def test_the_lenses_of_a_rig_are_those_of_its_file(tmp_path, make_camera_info):
         assert tuple(camera.K.ravel()) == frames.calibrations[name].K
 
 
-def test_refinement_turns_off_what_knows_more_than_the_points_of_a_frame(make_camera_info):
+def test_refinement_turns_off_what_knows_more_than_the_points_of_a_frame(begin):
     """However the settings come; asked for again, all of it is back."""
     wanted = NodeConfig(readout_time=READOUT_TIME, publish_tf="map_to_camera", refinement="none")
-    frames = CameraFrames(replace(wanted, publish_tf="none"))
-    frames.calibrate(read_camera_info(make_camera_info()))
+    frames, _ = begin(refinement="none")
 
     def told(config: NodeConfig) -> list[Localized]:
         frames.change(config)

@@ -43,8 +43,6 @@ Change = Callable[[Any, float], Iterable[Any]]
 
 
 class Flight:
-    """A recording in memory."""
-
     def __init__(self, path: Path) -> None:
         truth = read_motions(path, "/truth/pose", "/truth/twist").poses
         places = zip(truth.positions, truth.quaternions, strict=True)

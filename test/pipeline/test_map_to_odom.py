@@ -62,7 +62,6 @@ class Drive:
         return off, math.sqrt(self.decision.covariance[:3, :3].trace())
 
     def go(self, seconds: float, *, poses: bool = True, rate: float = 30.0, **seen: Any) -> None:
-        """Drive on."""
         for _ in range(round(seconds * rate)):
             self.time += 1.0 / rate
             turns = 0.4 * math.sin(self.time / 6.0)

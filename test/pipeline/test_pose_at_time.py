@@ -10,9 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at, with_timing
 
+from ..moving import estimate_at  # noqa: TID252 - Python has a package "test"
 from .motions import covariance_of, disturbed
 
 READOUT_TIME = 0.03
@@ -33,19 +35,14 @@ def estimate(rate: float, seed: int = 0, acceleration: float = 0.0, shake: float
     size = 3 * len(DEVIATIONS)
     root = rng.normal(size=(size, size)) / np.sqrt(size) * np.repeat(DEVIATIONS, 3)[:, None]
     direction = rng.normal(size=3)
-    return Estimate(
-        rotation=Rotation.from_rotvec(rng.normal(size=3)).as_matrix(),
-        translation=rng.normal(size=3),
-        angular_velocity=rate * direction / np.linalg.norm(direction),
-        linear_velocity=rate * rng.normal(size=3),
+    motion = Motion(
+        Rotation.from_rotvec(rng.normal(size=3)).as_matrix(), rng.normal(size=3),
+        rate * direction / np.linalg.norm(direction), rate * rng.normal(size=3),
         angular_acceleration=acceleration * rng.normal(size=3),
         linear_acceleration=acceleration * rng.normal(size=3),
-        shake=shake * SIZES * rng.normal(size=(SHAKING, 3)),
-        inliers=np.ones(20, dtype=bool),
-        residuals=np.ones(20),
-        joint_covariance=root @ root.T,
-        iterations=100,
-    )
+    )  # fmt: skip
+    shaking = shake * SIZES * rng.normal(size=(SHAKING, 3))
+    return estimate_at(motion, joint_covariance=root @ root.T, shake=shaking)
 
 
 def shake(motion: Estimate, tau: float) -> Array:
@@ -58,7 +55,6 @@ def shake(motion: Estimate, tau: float) -> Array:
 
 
 def pose(motion: Estimate, tau: float) -> tuple[Array, Array]:
-    """Rotation map_from_camera and camera centre."""
     angle = tau * motion.angular_velocity + 0.5 * tau**2 * motion.angular_acceleration
     way = tau * motion.linear_velocity + 0.5 * tau**2 * motion.linear_acceleration
     map_from_camera = motion.rotation.T
@@ -68,7 +64,6 @@ def pose(motion: Estimate, tau: float) -> tuple[Array, Array]:
 
 
 def pose_error(motion: Estimate, tau: float, error: Array) -> Array:
-    """Displacement, and rotation about fixed map axes, that an error brings."""
     rotation, position = pose(motion, tau)
     turned, moved = pose(disturbed(motion, error), tau)
     about_fixed_axes = Rotation.from_matrix(turned @ rotation.T).as_rotvec()

@@ -70,8 +70,6 @@ def frames_with_truth(
 
 
 class Watched:
-    """What is localized of some of the frames, and what is said of it."""
-
     def __init__(self, count: int = FRAMES, seen: Any = None, **settings: Any) -> None:
         self.clouds = [message for message, _ in seen or frames_with_truth()]
         self.said: list[tuple[str, str]] = []
@@ -85,11 +83,9 @@ class Watched:
 
     @property
     def notices(self) -> list[str]:
-        """Of the readout time."""
         return [text for name, text in self.said if name == "readout_time"]
 
     def last(self) -> Any:
-        """What the last frame gives, which has a twist."""
         found = self.frames.localize(self.clouds[-1])
         assert found
         assert found.twist is not None

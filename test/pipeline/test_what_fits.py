@@ -113,11 +113,18 @@ def cloud(t, pixels):
     return cloud_of(round((5.0 + t) * 1e9), corners(), pixels)
 
 
-def test_frames_say_it(make_camera_info):
+@pytest.fixture
+def begun(make_camera_info):
+    """Frames of the camera, and what they tell."""
     told = []
     frames = CameraFrames(NodeConfig(readout_time=READOUT), lambda *notice: told.append(notice))
     info = {"k": K.ravel(), "width": 640, "height": 480, "d": []}
     frames.calibrate(read_camera_info(make_camera_info(**info)))
+    return frames, told
+
+
+def test_frames_say_it(begun):
+    frames, told = begun
     times = np.arange(4) / 30.0
     results = [frames.localize(cloud(t, MIRROR(seen(corners(), t)))) for t in times]
     assert all(isinstance(result, Refusal) for result in results)
@@ -126,16 +133,12 @@ def test_frames_say_it(make_camera_info):
     assert frames.localize(cloud(1.0, seen(corners(), 0.2)))
 
 
-def test_a_mirrored_room_of_which_one_wall_fits(make_camera_info):
+def test_a_mirrored_room_of_which_one_wall_fits(begun):
     """Seen from behind, 24 of the 56 points have a pose; all of them have one unmirrored."""
     rng = np.random.default_rng(1)
     flat = rng.uniform([-1.2, -0.9, 3.6], [1.2, 0.9, 3.6], (24, 3))
     depth = rng.uniform([-1.2, -0.9, 2.0], [1.2, 0.9, 5.0], (32, 3))
-    room = np.concatenate([flat, depth])
-    told = []
-    frames = CameraFrames(NodeConfig(readout_time=READOUT), lambda *notice: told.append(notice))
-    info = {"k": K.ravel(), "width": 640, "height": 480, "d": []}
-    frames.calibrate(read_camera_info(make_camera_info(**info)))
+    (frames, told), room = begun, np.concatenate([flat, depth])
 
     def localized(k, undo):
         time = k / 30.0

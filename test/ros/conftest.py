@@ -64,8 +64,6 @@ LOGGED = {"RCUTILS_LOGGING_BUFFERED_STREAM": "0", "PYTHONFAULTHANDLER": "1"}
 
 
 class NodeProcess:
-    """The node, started as a user starts it."""
-
     def __init__(self, log: Path, *arguments: str, run: str, environment: dict[str, str]) -> None:
         self._log = log
         with log.open("w") as file:

@@ -14,7 +14,6 @@ from rs_localizer.native import COMPILES
 
 
 def run(function, values, outputs):
-    """Apply a traced function to values (inputs, LANES)."""
     if not COMPILES:
         pytest.skip("what is traced is a part of kernels: RS_LOCALIZER_KERNELS=numba runs it")
 

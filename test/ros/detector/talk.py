@@ -20,7 +20,6 @@ class Talk:
         self.open(kind)
 
     def open(self, kind: type) -> None:
-        """The camera publishes images of this kind."""
         self.publisher = self.peer.node.create_publisher(kind, TOPICS[kind], 1)
 
     def listen(self, kind: type, topic: str) -> Any:
@@ -37,8 +36,6 @@ class Talk:
             self.publisher.publish(message)
 
     def ask(self, message: Any, topic: str) -> Any:
-        """What comes of an image."""
-
         def answers() -> list[Any]:
             heard = self.heard[topic]
             return [m for m in heard if m.header.stamp.sec == message.header.stamp.sec]
@@ -47,7 +44,6 @@ class Talk:
         return answers()[0]
 
     def set(self, name: str, value: object) -> tuple[bool, str]:
-        """Set a parameter of the node."""
         answer: tuple[bool, str] = self.peer.set(f"/{self._node}", name, value)
         return answer
 

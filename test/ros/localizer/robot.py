@@ -138,7 +138,6 @@ class Robot:
         self.peer.spin_until(lambda: False, 0.3)  # the other side has to find us, too
 
     def send(self, info: Any, cloud: Any) -> None:
-        """Send a frame."""
         self.frames_sent += 1
         if info is not None:
             self.publishers["/camera_info"].publish(info)
@@ -168,15 +167,12 @@ class Robot:
 
     @property
     def received(self) -> int:
-        """Frames that have come to the node, by its diagnostics."""
         return int(self.values.get("Frames received", 0))
 
     def answered(self, name: str) -> dict[int, bytes]:
-        """What the node said on a topic, by stamp."""
         received = [typestore().deserialize_cdr(d, TYPES[name]) for d in self.answers[name]]
         return serialized(received, TYPES[name])
 
     def set(self, name: str, value: object) -> tuple[bool, str]:
-        """Set a parameter of the node."""
         answer: tuple[bool, str] = self.peer.set(self._node, name, value)
         return answer

@@ -85,7 +85,6 @@ class World(Robot):
         return message
 
     def table(self, index: int = 0) -> np.ndarray:
-        """The rows of a good frame."""
         cloud = self.clouds[index]
         kinds = {PointField.FLOAT32: "<f4", PointField.UINT32: "<u4"}
         columns = [(item.name, kinds[item.datatype]) for item in cloud.fields]
@@ -101,7 +100,6 @@ class World(Robot):
         assert self.peer.spin_until(condition), self.said
 
     def diagnosis(self, state: str) -> None:
-        """Wait until the diagnostics say this."""
         del self.states[:-1]
         self.wait(lambda: any(re.search(state, text) for text in self.states))
 

@@ -78,8 +78,6 @@ def record(folder: Path) -> Path:
 
 
 class Robot(around.Robot):
-    """One with transforms and an IMU."""
-
     def __init__(self, peer: Any, tf2_ros: Any) -> None:
         super().__init__(peer, "/imu")
         self._tf2_ros = tf2_ros

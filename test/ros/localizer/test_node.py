@@ -1,9 +1,11 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node as its users meet it: its own process, real DDS, signals, parameters, life cycle."""
+"""The node as its users meet it: its own process, DDS, signals, parameters, life cycle, rates."""
 
+import os
 import re
 import signal
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +16,18 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 
+from rs_localizer.config import NodeConfig
+from rs_localizer.io.bags import typestore
+from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.maps.files import write_npz
 from rs_localizer.io.maps.landmarks import Map
+from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import TYPES
+from rs_localizer.pipeline.camera_frames import CameraFrames
 
+from ..conftest import RUN  # noqa: TID252 - Python has a package "test"
 from .robot import READOUT_TIME, SHUTTER, Robot, inputs, record, replayed
 
 
@@ -175,3 +184,119 @@ def test_a_signal_while_a_frame_takes_long(recording, start_node, peer):
         peer.spin_until(lambda: False, 0.1)
     assert node.stop(signal.SIGTERM, signal.SIGTERM) == 0
     assert "Traceback" not in node.log
+
+
+# The frame after the flight takes for ever.
+SLOW = """
+import time; from rs_localizer.pipeline.camera_frames import CameraFrames as F
+localize, count = F.localize, iter(range(1000))
+def wait(self, message):
+    if next(count) == {frames}: print('a slow frame', flush=True); time.sleep(9999)
+    return localize(self, message)
+F.localize = wait
+"""
+
+
+def test_odometry_between_and_after_images(tmp_path, start_node, peer):
+    """By a simulated clock: 25 ms after each image, while one is localized, and then no more."""
+    record(tmp_path / "flight")
+    flight = inputs(tmp_path / "flight")
+    offline = CameraFrames(NodeConfig(readout_time=READOUT_TIME))
+    words = (*SHUTTER, "-p", "output_rate:=50.0", "-p", "use_sim_time:=true")
+    node = start_node(*words, run=SLOW.format(frames=len(flight)) + RUN)
+    robot = Robot(peer)
+    clock = peer.node.create_publisher(Clock, "/clock", 10)
+    robot.connect()
+
+    def said() -> dict[int, Any]:
+        kind = TYPES["odometry"]
+        found = [typestore().deserialize_cdr(d, kind) for d in robot.answers["odometry"]]
+        assert [stamp_ns(one) for one in found] == sorted({stamp_ns(one) for one in found})
+        return {stamp_ns(one): one for one in found}
+
+    def turn_to(time_ns: int) -> None:
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = divmod(time_ns, 10**9)
+        clock.publish(message)
+
+    def compare(time_ns: int) -> bool:
+        expected = offline.at(time_ns)
+        if expected is None:  # one frame alone is no motion yet
+            return False
+        turn_to(time_ns)
+        assert peer.spin_until(lambda: time_ns in said())
+        place = said()[time_ns].pose.pose.position
+        np.testing.assert_allclose([place.x, place.y, place.z], expected.pose.position, atol=1e-9)
+        return True
+
+    compared = []
+    for info, cloud in flight:
+        robot.localize(info, cloud)
+        offline.calibrate(read_camera_info(info))
+        assert offline.localize(cloud)
+        compared.append(compare(stamp_ns(cloud) + 25_000_000))
+    assert sum(compared) >= 10
+    cloud.header.stamp.nanosec += 10_000_000
+    while "a slow frame" not in node.log:
+        robot.send(None, cloud)
+        peer.spin_until(lambda: False, 0.2)
+    last_ns, count = stamp_ns(cloud), len(said())
+    assert all(compare(last_ns + later * 1_000_000) for later in (30, 50, 70))
+    assert len(robot.answers["inliers"]) == len(flight)
+    turn_to(last_ns + 300_000_000)  # beyond max_prediction
+    assert not peer.spin_until(lambda: len(said()) > count + 3, 0.5)
+
+
+# A module that tells that it is being imported, and takes its time.
+SLOW_IMPORT = (
+    "import pathlib, time; pathlib.Path(__file__).with_suffix('.seen').touch(); time.sleep(9999)"
+)
+
+
+def test_signals_while_it_imports(start_node, tmp_path):
+    (tmp_path / "rclpy.py").write_text(SLOW_IMPORT)
+    node = start_node(PYTHONPATH=f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
+    while not (tmp_path / "rclpy.seen").exists():
+        assert node.process.poll() is None, node.log
+        time.sleep(0.02)
+    assert node.stop(signal.SIGTERM) == 0
+    assert node.log == ""
+
+
+def test_started_with_bad_parameters(start_node):
+    node = start_node("--params-file", "/nowhere.yaml")
+    assert node.process.wait() == 1
+    fatal = [line for line in node.log.splitlines() if line.startswith("[FATAL]")]
+    assert len(fatal) == 1
+    assert "/nowhere.yaml" in fatal[0]
+    assert "Traceback" not in node.log
+
+
+def test_an_end_that_the_middleware_holds_up_is_cut_short(start_node):
+    """Launch files kill what has not ended after five seconds."""
+    node = start_node(
+        run="import rclpy, sys, time; rclpy.try_shutdown = lambda: time.sleep(9999);"
+        "from rs_localizer.ros.main import main; sys.exit(main())"
+    )
+    node.wait_for_log("active with solver")
+    assert node.stop(signal.SIGTERM) == 0
+    assert "did not end within 4 s" in node.log
+    assert "in run" in node.log
+
+
+def test_what_it_says_at_start_and_an_end_by_signals(start_node, tmp_path):
+    file = tmp_path / "params.yaml"
+    file.write_text("/**:\n  ros__parameters: {min_inlier: 9, use_sim_time: false}\n")
+    node = start_node("--params-file", str(file), "-p", "readout_tim:=0.1")
+    node.wait_for_log("active with solver")
+    lines = [line.partition("]: ")[2] for line in node.log.splitlines()]
+    ignored = "a parameter is ignored: {} is not a setting; did you mean {}?"
+    assert [line for line in lines if "ignored" in line] == [
+        ignored.format("'min_inlier'", "min_inliers"),
+        ignored.format("'readout_tim'", "readout_time"),
+    ]
+    silent = "readout_time is 0 (unknown): no twist is published and frames are not tracked"
+    assert lines.count(silent) == 1
+    assert node.stop(signal.SIGINT, signal.SIGINT, signal.SIGTERM, signal.SIGTERM) == 0
+    assert "Traceback" not in node.log
+    assert "rror" not in node.log

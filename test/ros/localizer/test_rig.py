@@ -43,8 +43,6 @@ def recording(tmp_path_factory) -> Path:
 
 
 class Robot(around.Robot):
-    """Sends what two cameras see."""
-
     def __init__(self, peer: Any, tf2_ros: Any) -> None:
         super().__init__(peer)
         self.publishers = {

@@ -30,7 +30,6 @@ HALF_TURN, NO_TURN = (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
 @pytest.fixture
 def robot(peer) -> Any:
-    """Sends transforms, and hears what comes on TF."""
     with tf2_ros() as tf2:
         moving = tf2.TransformBroadcaster(peer.node)
         static: list[Any] = []
@@ -86,7 +85,6 @@ def frame(stamp_ns: int, x: float = 0.0) -> Localized:
 
 
 def awaited(peer: Any, ask: Callable[[], Any]) -> Any:
-    """What is answered, once there is an answer."""
     found: list[Any] = []
 
     def there() -> bool:
@@ -110,7 +108,6 @@ def odometry(node: Any, robot: Any, peer: Any, *tenths: int) -> None:
 
 
 def heard(robot: Any, peer: Any, parent: str, child: str, stamp_ns: int = 0) -> Any:
-    """What another node makes of what was sent."""
     at = Time(nanoseconds=stamp_ns)
     return awaited(peer, lambda: robot.buffer.lookup_transform(parent, child, at))
 

@@ -1,22 +1,29 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters are the settings: declared with description and range, refused with the reason."""
+"""Parameters, clock and views of a node."""
 
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import rclpy
+from rclpy.clock import ClockType
 from rclpy.context import Context
 from rclpy.parameter import Parameter
+from rclpy.time import Time
+from scipy.spatial.transform import Rotation
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.camera_files import lens_parameters
 from rs_localizer.io.rigs import RigParts, mounted_lenses, node_parameters
+from rs_localizer.ros.node.clock import watch_clock
 from rs_localizer.ros.node.parameters import SettingsNode
+from rs_localizer.ros.node.views import camera_marker
 from rs_localizer.settings import settings, write_parameters
 
 
@@ -125,3 +132,58 @@ def test_a_file_of_a_camera_or_of_a_rig_is_a_params_file_too(context, tmp_path, 
     assert configs[1].cameras == ("a", "b")
     own = configs[1].of_cameras["b"]
     assert (own.readout_time, own.stamp_offset) == (0.02, 0.01)
+
+
+def test_a_node_hears_jumps_and_no_steps(peer):
+    simulated = [Parameter("use_sim_time", value=True)]
+    node = rclpy.create_node("simulated", context=peer.node.context, parameter_overrides=simulated)
+    told: list[float] = []
+    handle = watch_clock(node, told.append)
+
+    def set_to(seconds: float) -> None:
+        stamp = Time(nanoseconds=round(1e9 * seconds), clock_type=ClockType.ROS_TIME)
+        node.get_clock().set_ros_time_override(stamp)
+
+    for tick in range(20):  # the first one sets it
+        set_to(1e9 + 0.1 * tick)
+    assert told == []
+    set_to(3.0)
+    assert told.pop() == pytest.approx(-1e9 + 1.1)
+    for tick in range(20):  # played tenfold
+        set_to(5.0 + 1.0 * tick)
+    assert told == []
+    set_to(60.0)
+    set_to(60.1)
+    assert told == pytest.approx([36.0])
+    set_to(20.0)
+    assert told[1:] == pytest.approx([-40.1])
+    node.set_parameters([Parameter("use_sim_time", value=False)])
+    assert len(told) == 3
+    handle.unregister()
+    node.destroy_node()
+
+
+def numbers(points: Any) -> Any:
+    return np.array([[p.x, p.y, p.z] for p in points])
+
+
+@pytest.mark.parametrize(
+    ("doubt", "color"),
+    [(0.0, (0, 1, 0)), (0.5, (1, 1, 0)), (1.0, (1, 0, 0)), (np.nan, (0.2, 0.5, 1.0))],
+)
+def test_the_camera_stands_where_it_is_and_its_colour_is_the_doubt(doubt, color):
+    turn = Rotation.from_euler("xyz", [20, -40, 70], degrees=True)
+    estimate = SimpleNamespace(
+        rotation=turn.inv().as_matrix(), position=np.array([1.0, 2.0, 3.0]), integrity=doubt
+    )
+    frame: Any = SimpleNamespace(map_frame="hall", stamp_ns=5 * 10**9, estimate=estimate)
+    camera = Camera(5, 5, K=np.array([[4.0, 0.0, 2.0], [0.0, 4.0, 2.0], [0.0, 0.0, 1.0]]))
+    marker = camera_marker(frame, camera)  # which sees half a metre to each side, in one
+    assert (marker.header.stamp.sec, marker.header.frame_id, marker.ns) == (5, "hall", "camera")
+    q, p = marker.pose.orientation, marker.pose.position
+    pose = Rotation.from_quat([q.x, q.y, q.z, q.w])
+    assert pose.as_matrix() == pytest.approx(turn.as_matrix())
+    assert [p.x, p.y, p.z] == [1.0, 2.0, 3.0]
+    assert (marker.color.r, marker.color.g, marker.color.b) == pytest.approx(color)
+    assert len(marker.points) == 16  # four sides, four rays
+    assert numbers(marker.points)[:, 2].max() == pytest.approx(0.3 * 2 / np.sqrt(6.0))

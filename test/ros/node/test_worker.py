@@ -40,8 +40,6 @@ def waits(function: Callable[[], Any]) -> bool:
 
 
 class Fake:
-    """Stands in for the localizer of the frames."""
-
     def __init__(self) -> None:
         self.settings = "old"
         self.started = threading.Semaphore(0)

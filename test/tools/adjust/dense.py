@@ -29,7 +29,6 @@ def jacobian(rows: Rows, count: int) -> np.ndarray:
 
 
 def normal_of(groups: Groups, terms: Sequence[Rows | Quadratic]) -> tuple[np.ndarray, np.ndarray]:
-    """The whole matrix of normal equations, and the slope."""
     count = unknowns(groups)
     matrix, slope = np.zeros((count, count)), np.zeros(count)
     for term in terms:

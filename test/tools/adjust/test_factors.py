@@ -105,7 +105,6 @@ def small(
     of: str = "board", direction: str = "top_to_bottom", distortion: str = "plumb_bob",
     controls: float = 0.4,
 ) -> tuple[Problem, Unknowns]:  # fmt: skip
-    """Keypoints of one camera with errors of zero."""
     rng, camera = np.random.default_rng(0), make_camera(scan_direction=direction)
     if distortion == "equidistant":
         camera = replace(camera, D=np.array([0.01, -0.02, 0.003, 0.001]),

@@ -1,16 +1,23 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated frames: every point where its own row sees it, noise and outliers as ordered; true
-motions: their velocities are the derivatives of their poses."""
+"""The simulator of cameras, rigs and IMUs against independent projections and differences."""
+
+import math
 
 import numpy as np
 import pytest
+from recorded import record
 from scipy.spatial.transform import Rotation
 
+from rs_localizer import data
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.io.trajectories import Trajectory
+from rs_localizer.io.bags import open_bag
+from rs_localizer.io.clouds import read_correspondences
+from rs_localizer.io.rigs import RigParts, mounted_lenses, node_parameters
+from rs_localizer.io.trajectories import Trajectory, read_tum
+from rs_localizer.settings import write_parameters
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import (
     FrameSettings,
@@ -18,7 +25,13 @@ from rs_localizer.tools.simulation.simulated_frames import (
     frame_stamps,
     simulate_frames,
 )
-from rs_localizer.tools.simulation.simulated_imu import shaken
+from rs_localizer.tools.simulation.simulated_imu import (
+    ImuSettings,
+    Lever,
+    Shaken,
+    shaken,
+    simulate_imu,
+)
 from rs_localizer.tools.simulation.simulated_recording import MountedMotion
 from rs_localizer.tools.simulation.true_motion import (
     BODY_FROM_CAMERA,
@@ -175,3 +188,83 @@ def test_a_mounted_camera_sees_points_where_its_rig_carries_it():
         state.rotations[0].T @ (point - state.positions[0]) for state in (rig, camera)
     )
     np.testing.assert_allclose(in_camera, TURN @ in_rig + PLACE, atol=1e-12)
+
+
+MATRIX = np.array([[450.0, 0.0, 320.0], [0.0, 450.0, 240.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.fixture(scope="module")
+def rig_recording(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rig")
+    cameras = {
+        "front": Camera(640, 480, MATRIX, readout_time=0.03),
+        "rear": Camera(640, 480, MATRIX, None, "plumb_bob", 0.02, "bottom_to_top"),
+    }
+    poses = {"front": (np.eye(3), np.zeros(3)), "rear": (TURN, PLACE)}
+    parts = RigParts(cameras, poses, {"front": 0.0, "rear": -0.25})
+    write_parameters(folder / "chain.yaml", node_parameters(parts), mounted_lenses(parts))
+    out = folder / "seen"
+    still = ("--duration", 1, "--noise", 0, "--outliers", 0)
+    turn = ("--angular-velocity", 0.4, 0.8, -0.5)
+    record(out, "--rig", folder / "chain.yaml", *still, *turn)
+    return out, parts
+
+
+def test_pixels_are_those_of_the_row_by_the_cameras_own_clock(rig_recording):
+    out, parts = rig_recording
+    angular, stamps = np.array([0.4, 0.8, -0.5]), {}
+    start = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    with open_bag(out) as bag:
+        for name, readout in (("front", 0.03), ("rear", 0.02)):
+            clouds = [m for _, _, m in bag.messages((f"/{name}/correspondences",))]
+            stamps[name] = [read_correspondences(m).stamp_ns for m in clouds]
+            cloud = read_correspondences(clouds[-1])
+            rotation, translation = parts.camera_from_rig[name]
+            row = cloud.pixels[:, 1] / 479.0
+            row = row if name == "front" else 1.0 - row
+            # The rig starts to turn about its origin at 1 s of true time; stamps of rear are late.
+            times = 1e-9 * cloud.stamp_ns - 1.0 + parts.time_offset[name] + readout * row
+            for point, pixel, time in zip(cloud.points, cloud.pixels, times, strict=True):
+                map_from_rig = start @ Rotation.from_rotvec(angular * time).as_matrix()
+                x, y, z = rotation @ (map_from_rig.T @ point) + translation
+                np.testing.assert_allclose(pixel, [450 * x / z + 320, 450 * y / z + 240], atol=2e-3)
+    assert all(len(own) >= 28 for own in stamps.values())
+    # Clocks run freely: neither at once, nor at the same rate.
+    pairs = min(len(s) for s in stamps.values())
+    apart = np.array(stamps["rear"][:pairs]) - stamps["front"][:pairs] - 250_000_000
+    assert np.abs(apart).min() > 1e5
+    assert np.ptp(apart) > 1e3
+
+
+PERFECT = ImuSettings(2000.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+CAMERA_FROM_IMU = Rotation.from_euler("xyz", [20.0, -70.0, 140.0], degrees=True).as_matrix()
+LEVER = Lever(CAMERA_FROM_IMU, np.array([0.1, -0.05, 0.02]))
+RNG = np.random.default_rng(0)
+
+
+def test_the_motion_comes_back_when_it_is_integrated():
+    """Dead reckoning by the midpoint rule, over a second of a hand that shakes."""
+    hand = RecordedMotion(read_tum(data.path(data.HAND_MOTION)).part(slice(0, 300)))
+    motion = Shaken(hand, math.radians(0.3), 60.0, np.array([0.6, 0.0, 0.8]), 1.0)
+    first = hand.intervals_ns[0][0]
+    track = simulate_imu(motion, PERFECT, LEVER, RNG)
+    count = 2001
+    start = motion.state(first, np.zeros(1))
+    map_from_imu = Rotation.from_matrix(start.rotations[0] @ CAMERA_FROM_IMU)
+    place = start.positions[0] + start.rotations[0] @ LEVER.position
+    speed = start.rotations[0] @ (start.linear[0] + np.cross(start.angular[0], LEVER.position))
+    gravity = np.array([0.0, 0.0, -9.80665])
+    dt = 1.0 / PERFECT.rate
+    for i in range(count - 1):
+        rate = 0.5 * (track.angular_velocities[i] + track.angular_velocities[i + 1])
+        halfway = map_from_imu * Rotation.from_rotvec(0.5 * dt * rate)
+        force = 0.5 * (track.specific_forces[i] + track.specific_forces[i + 1])
+        pull = halfway.apply(force) + gravity
+        place, speed = place + dt * speed + 0.5 * dt**2 * pull, speed + dt * pull
+        map_from_imu = map_from_imu * Rotation.from_rotvec(dt * rate)
+    end = motion.state(int(track.times_ns[count - 1]), np.zeros(1))
+    turned = Rotation.from_matrix(end.rotations[0] @ CAMERA_FROM_IMU)
+    assert (turned.inv() * map_from_imu).magnitude() < math.radians(0.01)
+    there = end.positions[0] + end.rotations[0] @ LEVER.position
+    assert np.linalg.norm(place - there) < 1e-3
+    assert np.linalg.norm(there - start.positions[0]) > 0.1  # it has been somewhere
