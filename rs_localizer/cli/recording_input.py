@@ -189,11 +189,10 @@ def opened(args: ImageOptions, calibrated: bool = True) -> Iterator[Source]:
         return
     if args.remaps:
         raise UsageError("-r names topics of a bag")
+    clock, total, files = ImageClock(args.rate), None, image_files(path) if path.is_dir() else []
     if camera is None and calibrated:
         raise UsageError("a video or folder has no camera_info: give --camera")
-    clock, total = ImageClock(args.rate), None
-    if path.is_dir():
-        files = image_files(path)
+    if files:
         if args.rate is None and name_times(files) is None:
             raise UsageError("the names of the files are not times: give --rate")
         shots, total = from_files(files, camera, clock), len(files)

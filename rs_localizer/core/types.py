@@ -29,6 +29,8 @@ _ROWS = np.linspace(-0.5, 0.5, 17)
 _PARABOLAS = np.vander(_ROWS, 3) @ np.linalg.pinv(np.vander(_ROWS, 3))
 # Pixels at the rim lie a little beyond the first and the last row.
 _LAST_ROW = 0.55
+# Those beyond the image, of what a lens moves there, at most so far.
+_FARTHEST = 1.0
 # s: no motion goes on as it is for so long; more are milliseconds or nanoseconds.
 _LONGEST_AWAY = 60.0
 
@@ -161,8 +163,17 @@ class Estimate(Motion):
         return turned @ rotation, turned @ translation
 
     def at_rows(self, tau: Array) -> tuple[Array, Array]:
-        """Return the rotations (n,3,3) and translations (n,3) camera_from_map at row times (n,)."""
+        """Return the rotations (n,3,3) and translations (n,3) camera_from_map at row times (n,).
+
+        Raises:
+            ValueError: for what is no row time of a pixel in or near the image.
+        """
         rotations, translations = Motion.at_rows(self, tau)
+        if (farthest := np.abs(tau).max(initial=0.0)) > _FARTHEST:
+            raise ValueError(
+                f"tau must be row times, -0.5 of the first row and 0.5 of the last, got one of "
+                f"{farthest:g}: camera.row_time(pixels) gives those of pixels"
+            )
         if not len(self.shake):
             return rotations, translations
         turns = shake_at(np.clip(np.asarray(tau, float), -0.5, 0.5), self.shake)

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Acceptance of estimates, and what users get: nothing is published rather than a wrong pose."""
+"""Acceptance of estimates and of their twists: nothing is published rather than a wrong pose."""
 
 from __future__ import annotations
 

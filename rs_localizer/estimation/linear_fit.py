@@ -77,8 +77,8 @@ IN_FUNCTIONS[:PARAMETERS, :PARAMETERS] = np.eye(PARAMETERS)
 IN_FUNCTIONS[PARAMETERS:, PARAMETERS:] = np.kron(COMBINATIONS, np.eye(3))
 
 FACTORS = np.exp(1.15 * np.arange(-1.0, 4.0))
-"""Vibration is so many times the ordinary one: two in a decade, up to 0.6 deg. Of smaller ones twists
-are no better, nor more often inside."""
+"""Vibration is so many times the ordinary one: two in a decade, up to 0.6 deg. With smaller ones
+twists are no better, nor more often inside."""
 # Cycles per readout about which a vibration is, its width (logarithm), and the part of others.
 _BANDS, _WIDTH, _FLOOR = (1.0, 2.0, 3.0, 5.0), 0.35, 0.1
 # Cycles of a vibration about the optical axis, which moves points so little that its size may be

@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The best motion of a frame: Levenberg-Marquardt with a prior; inliers by noise, noise by inliers.
+"""The best motion of a frame (Levenberg-Marquardt with a prior), and which points are outliers.
 
 Parameters of a step, as in ``Estimate.covariance``: the camera turns by ``exp([phi]x)`` in its own
 axes, moves by ``rho`` along them, and velocities and accelerations change additively.

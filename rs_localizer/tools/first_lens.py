@@ -57,7 +57,7 @@ def first_lens(size: tuple[int, int], images: list[ImagePoints]) -> Camera:
     if len(chosen) < _LEAST_IMAGES:
         raise ValueError(
             f"{len(chosen)} images show enough of the map for a first calibration, at least "
-            f"{_LEAST_IMAGES} are needed; give --calibration"
+            f"{_LEAST_IMAGES} are needed; film it closer, or give its lens"
         )
     fewest = max(_LEAST_IMAGES, len(chosen) // 2)
     while True:

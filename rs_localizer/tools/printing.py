@@ -84,9 +84,10 @@ def _page(black: Array, page: str, text: str, pose: Pose) -> Page:
     low, high = black[:, :2].min(axis=0), (black[:, :2] + black[:, 2:]).max(axis=0)
     if paper is None:
         width, height = high - low
+        of = text.partition(": its")[0].partition(";")[0]
         raise ValueError(
-            f"{text.partition(';')[0]} takes {width:.0f} x {height:.0f} mm, more than {page} has "
-            "room for; choose a larger page or a smaller size"
+            f"{of} takes {width:.0f} x {height:.0f} mm, more than {page} has room for; choose a "
+            "larger page or a smaller size"
         )
     room = np.array([paper[0], paper[1] + _FOOT])
     axes = np.abs(pose.rotation).argmax(axis=0)

@@ -235,6 +235,9 @@ def test_what_is_missing_is_said(walls: Path, tmp_path: Path, capsys: Any) -> No
     words = ["replay", str(walls.parent / "walls.mp4"), "--out", str(tmp_path / "out"), "--map"]
     assert main([*words, str(walls / "marker_map.yaml")]) == 2
     assert "a video or folder has no camera_info: give --camera" in capsys.readouterr().err
+    (empty := tmp_path / "empty").mkdir()
+    assert main(["detect", str(empty), *words[2:], str(walls / "marker_map.yaml")]) == 1
+    assert "empty has no images" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     assert main(["replay", str(walls.parent / "walls.mp4")]) == 1
     assert "walls.mp4 is a video, not matches: give --map, of markers" in capsys.readouterr().err

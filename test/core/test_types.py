@@ -66,6 +66,8 @@ def test_velocities_are_the_derivatives_of_the_poses(shaken):
         np.testing.assert_allclose(pose[1], estimate.at(tau)[1], atol=1e-12)
     with pytest.raises(ValueError, match=r"row times of shape \(n,\), got \(1, 3\)"):
         estimate.at_rows(rows[None])
+    with pytest.raises(ValueError, match=r"row times.* got one of 479"):
+        estimate.at_rows(np.arange(480))
 
 
 def apart(one, other):

@@ -261,7 +261,7 @@ def test_markers_that_do_not_fit_together_get_pages_of_their_own():
     assert found.ids.tolist() == [4, 5, 6, 7]
     side = np.linalg.norm(found.pixels[0] - found.pixels[1]) * PIXEL
     assert side == pytest.approx(0.12, abs=3e-5)
-    with pytest.raises(ValueError, match="takes 400 x 400 mm, more than a4 has room for"):
+    with pytest.raises(ValueError, match="id 0 takes 400 x 400 mm, more than a4 has room for"):
         plan(MarkerMap(wall("4x4_50", (1, 1), 0.4, 0.1)))
 
 

@@ -84,7 +84,8 @@ def hindrance(summary: Summary, what: str) -> str:
     if lost > SOME * came:
         return (
             f"messages are lost: by their stamps, {lost} of {came + lost} have not come in the "
-            f"last {WINDOW:.0f} s (is the publisher best effort, or the machine too slow?)"
+            f"last {WINDOW:.0f} s (is the publisher best effort, "
+            "does it pause, or is the machine too slow?)"
         )
     return ""
 
