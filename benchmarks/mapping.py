@@ -23,6 +23,7 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.estimation.calibration import ErrorModes
 from rs_localizer.features.extraction import Features
 from rs_localizer.localizer import Localizer
+from rs_localizer.markers import prints
 from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.prints import Marker
@@ -33,7 +34,7 @@ from rs_localizer.tools.mapping.map_keypoints import MapFreedom, MapObservations
 from rs_localizer.tools.mapping.refinement import refine
 from rs_localizer.tools.mapping.structure import SeenImage, Structure
 from rs_localizer.tools.mapping.survey import Survey, survey
-from rs_localizer.tools.mapping.unknown_markers import Filmed, Spotted, every_marker
+from rs_localizer.tools.mapping.unknown_markers import Filmed, Spotted
 from rs_localizer.tracking import FrameContext, Tracker
 
 _HALF = 2.5  # m, of the room
@@ -250,7 +251,8 @@ def _survey(wall: bool, seeds: list[int]) -> _Errors:
     film = Film(_CAMERA, walk, np.arange(0.0, 30.0, 1.0 / 30.0))
     camera = believed(_CAMERA)
     filmed = Filmed(camera, film.spot(poses, size, rng))
-    found = survey(filmed, every_marker([family(_FAMILY)], size, {}))
+    count = family(_FAMILY).count
+    found = survey(filmed, [Marker.at(_FAMILY, id_, size, prints.Pose()) for id_ in range(count)])
     turn, origin = poses[found.markers[0].id]
     true = [(turn.T @ poses[m.id][0], turn.T @ (poses[m.id][1] - origin)) for m in found.markers]
     off = _off(found, true, np.eye(3), np.zeros(3))

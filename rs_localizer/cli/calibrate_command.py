@@ -6,52 +6,30 @@ from __future__ import annotations
 
 import shlex
 import shutil
-import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rs_localizer.cli import refuse_existing, typed, write_all
+from rs_localizer.cli.calibration_input import CalibrationInput, InputOptions, read_input
 from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
-from rs_localizer.cli.recording_input import (
-    ImageOptions,
-    TargetOptions,
-    cameras_of,
-    check_there,
-    each_image,
-    find_map,
-    given_values,
-    recorded,
-    remapped,
-)
-from rs_localizer.config import CalibrationErrors, DetectorConfig, NodeConfig
+from rs_localizer.cli.recording_input import cameras_of, given_values
+from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io import rigs
-from rs_localizer.io.bags import BagReader, is_bag, open_bag
 from rs_localizer.io.camera_files import lens_parameters, write_calibration
-from rs_localizer.io.imu import ImuRecording
-from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.rigs import RigParts
-from rs_localizer.io.topics import IMAGE, IMU
 from rs_localizer.markers.map_files import write_marker_map
-from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.offline.fleet import Figures
-from rs_localizer.offline.recordings import read_imu_recording
-from rs_localizer.offline.replay import has_frames
-from rs_localizer.pipeline.marker_detector import FrameDetector
 from rs_localizer.settings import build, write_parameters
 from rs_localizer.tools import verdict
-from rs_localizer.tools.adjust.intrinsics import LensErrors
-from rs_localizer.tools.adjust.observe import ImagePoints, in_order
 from rs_localizer.tools.camera_calibration import (
     CameraCalibration,
     calibrate,
     calibrate_either_axis,
-)
-from rs_localizer.tools.first_lens import first_lens
+)  # fmt: skip
 from rs_localizer.tools.rig_mounts import calibrate_rig
 
 # Names of the files beside FILE.yaml, after FILE_.
@@ -60,7 +38,7 @@ Writers = dict[Path, Callable[[Path], object]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(TargetOptions, ImageOptions, ResultOptions):
+class Options(InputOptions, ResultOptions):
     recordings: list[Path] = argument(
         "a bag of correspondences or keypoints; or, with --map or --board, images: a video, a "
         "folder, a bag; several with --rig", "RECORDING",
@@ -71,11 +49,6 @@ class Options(TargetOptions, ImageOptions, ResultOptions):
         "clock are the rig's. Cameras are named as their files, or as their topics begin; so are "
         "the lenses of --camera", default=False,
     )  # fmt: skip
-    intrinsics: bool = option("find the lens as well", default=False)
-    imu: bool = option(
-        "find how the IMU of a bag goes with the camera: offset of its stamps, rotation, bias",
-        default=False,
-    )  # fmt: skip
     out: Path | None = option(
         "all that is known of the camera or the rig, lens and shutter: --camera of the other "
         "commands, params file and camera_file of the node", "FILE.yaml",
@@ -83,18 +56,6 @@ class Options(TargetOptions, ImageOptions, ResultOptions):
     camera_info: Path | None = option(
         "also the lens alone, for ROS drivers (of a rig, FILE_NAME for each)", "FILE"
     )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Input:
-    """Images with correspondences, and their camera."""
-
-    images: list[ImagePoints]
-    camera: Camera
-    find_lens: bool  # it is to be found, or a first guess of this command
-    imu: ImuRecording | None = None
-    map: MarkerMap | None = None  # of images
-    own_stamps: bool = True
 
 
 def run(options: Options) -> Mapping[str, object]:
@@ -121,17 +82,16 @@ def run(options: Options) -> Mapping[str, object]:
         if not options.rig and (options.map is not None or options.board is not None):
             beside = [_beside(out, _MAP)]
         refuse_existing(options, out, *beside, *_lens_files(options, cameras).values())
-    sources, found = dict[str, _Input](), dict[str, CameraCalibration]()
+    sources, found = dict[str, CalibrationInput](), dict[str, CameraCalibration]()
     for name, (own, _) in cameras.items():
         if name:
             print(f"{name}:")
         axis = config.of_cameras.get(name, config).scan_direction
-        source = _read(own, replace(config, scan_direction=axis))
+        source = read_input(own, replace(config, scan_direction=axis))
         sources[name] = replace(source, camera=replace(source.camera, scan_direction=axis))
         found[name] = _calibrated(own, sources[name], config, any_axis)
     if options.rig:
-        frames = {name: frame for name, (_, frame) in cameras.items()}
-        _mount(options, sources, found, config, frames)
+        _mount(options, sources, found, config, {name: of for name, (_, of) in cameras.items()})
         return {name: _figures(each) for name, each in found.items()}
     if refusal := verdict.lens_refusal(found[""]):
         raise ValueError(refusal)
@@ -172,7 +132,7 @@ def _lens_writers(args: Options, cameras: Mapping[str, Camera]) -> Writers:
 
 
 def _calibrated(
-    args: Options, source: _Input, config: NodeConfig, any_axis: bool
+    args: Options, source: CalibrationInput, config: NodeConfig, any_axis: bool
 ) -> CameraCalibration:
     """Calibrate a camera by its images and print the result; ``any_axis``: none was given."""
     one = calibrate_either_axis if any_axis else calibrate
@@ -188,53 +148,9 @@ def _calibrated(
     return found
 
 
-def _read(args: Options, config: NodeConfig) -> _Input:
-    path, topics = args.recording, remapped(args)
-    check_there([path])
-    of_bag, imu = is_bag(path), None
-    if args.imu and not of_bag:
-        raise UsageError("--imu is for bags, which have an IMU beside the images")
-    with open_bag(path) if of_bag else nullcontext() as bag:
-        if bag is not None and args.imu:
-            imu = read_imu_recording(bag, topics.get(IMU))
-        if bag is not None and IMAGE not in topics and has_frames(bag):
-            if args.rate is not None:
-                raise UsageError("--rate is for images; a bag has its own times")
-            return replace(_correspondences(args, bag, config), imu=imu)
-    own_stamps = of_bag or (path.is_dir() and args.rate is None)
-    return replace(_detected(args), own_stamps=own_stamps, imu=imu)
-
-
-def _correspondences(args: Options, bag: BagReader, config: NodeConfig) -> _Input:
-    if args.board is not None:
-        raise UsageError("--board is for images; the recording has correspondences")
-    landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
-    camera, clouds = recorded(args, bag, config, landmarks)
-    images = [ImagePoints(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in clouds]
-    return _Input(images, camera, args.intrinsics)
-
-
-def _detected(args: Options) -> _Input:
-    marker_map = find_map(args)
-    detector = FrameDetector(DetectorConfig(), lambda name, text: None, marker_map)
-    images = list[ImagePoints]()
-    camera: Camera | None = None
-    size = (0, 0)
-    for image, own in each_image(args, NodeConfig().scan_direction, calibrated=False):
-        camera, size = camera or own, image.pixels.shape[::-1]
-        found = detector.detect(image).detections
-        images.append(ImagePoints(image.stamp_ns, found.points, found.pixels))
-    print(f"{sum(len(it.points) > 0 for it in images)} of {len(images)} images show the map")
-    if detector.mistake:
-        print(f"warning: {detector.mistake}", file=sys.stderr)
-    find_lens = args.intrinsics or camera is None
-    camera = camera or first_lens(size, in_order(images))
-    return _Input(images, camera, find_lens, map=marker_map)
-
-
 def _write(
-    args: Options, out: Path, found: CameraCalibration, source: _Input, config: NodeConfig,
-    refused: str,
+    args: Options, out: Path, found: CameraCalibration, source: CalibrationInput,
+    config: NodeConfig, refused: str,
 ) -> str:  # fmt: skip
     """Write FILE.yaml, beside it the map as it was found, and print what comes next.
 
@@ -244,7 +160,7 @@ def _write(
     Returns:
         ``refused``, with what was written in spite of it.
     """
-    shape, marker_map, camera = args.map, source.map, found.fit.camera
+    shape, marker_map = args.map, source.map
     values: dict[str, Any] = {"scan_direction": config.scan_direction}
     if not refused:
         values = {
@@ -266,13 +182,13 @@ def _write(
             writers[shape] = partial(write_marker_map, marker_map=marker_map)
     if refused and not writers and not source.find_lens:
         return refused
-    values |= _deviations(
+    values |= verdict.deviations(
         [found] if source.find_lens else [], [] if marker_map is None else [marker_map], config
     )
     remarks = [f"readout_time {refused}"] if refused else []
-    lens = lens_parameters(camera)
+    lens = lens_parameters(found.fit.camera)
     write = partial(write_parameters, values=values, lens=lens, remarks=remarks)
-    write_all({**writers, **_lens_writers(args, {"": camera}), out: write})
+    write_all({**writers, **_lens_writers(args, {"": found.fit.camera}), out: write})
     if refused:
         refused += (
             f"; written to {out} and beside it: lens, map; not written: readout time and "
@@ -291,28 +207,8 @@ def _write(
     return refused
 
 
-def _deviations(
-    found: Sequence[CameraCalibration], maps: Sequence[MarkerMap], config: NodeConfig
-) -> dict[str, float]:
-    """Return the settings of the deviations of lens and map.
-
-    Args:
-        found: with lenses that were estimated, of which the worst counts; else those that were
-            given hold on.
-    """
-    errors, known = config.calibration, dict[str, float]()
-    if found or errors != CalibrationErrors():
-        for name in LensErrors._fields:
-            own = [float(getattr(each.lens, name)) for each in found] or [getattr(errors, name)]
-            known[f"calibration.{name}"] = float(f"{max(own):.4g}")
-    declared = [each.settings.get("map_deviation", 0.0) for each in maps]
-    if map_deviation := config.map_deviation or max(declared, default=0.0):
-        known["map_deviation"] = float(f"{map_deviation:.3g}")
-    return known
-
-
 def _mount(
-    args: Options, sources: Mapping[str, _Input], found: Mapping[str, CameraCalibration],
+    args: Options, sources: Mapping[str, CalibrationInput], found: Mapping[str, CameraCalibration],
     config: NodeConfig, frames: Mapping[str, str],
 ) -> None:  # fmt: skip
     """Find how cameras that are calibrated are mounted on a rig, print it and write it."""
@@ -343,7 +239,7 @@ def _mount(
         {name: (own.axes, -own.axes @ own.centre) for name, own in mounts.items()},
         {name: base + own.offset for name, own in mounts.items()},
     )
-    values = rigs.node_parameters(parts) | _deviations(alone, maps, config)
+    values = rigs.node_parameters(parts) | verdict.deviations(alone, maps, config)
     place, lens = _beside(args.out, _TRANSFORMS), rigs.mounted_lenses(parts)
     write_all({
         place: partial(rigs.write_static_transforms, parts=parts, frames=frames),

@@ -21,17 +21,12 @@ from rs_localizer import data
 from rs_localizer.cli import detect_command, simulate_command, stage, typed
 from rs_localizer.cli.options import option
 from rs_localizer.config import NodeConfig
+from rs_localizer.io import recording
 from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.recording import (
-    CAMERA_INFO_TOPIC,
-    CORRESPONDENCES_TOPIC,
-    MARKER_MAP,
-    PARAMETERS,
-)
 from rs_localizer.io.trajectories import Motions, read_motions
 from rs_localizer.offline.results import Track
 from rs_localizer.pipeline.camera_frames import CameraFrames
@@ -45,6 +40,7 @@ _FLIGHT, _WALLS = (8.0, 18.0), (21.366, 3.533)
 _EXPOSURE = 0.001  # s, of a row in a bright room: at 200 deg/s it blurs by 2 px
 _QUICK_FRAMES = 12
 _METHODS = (NodeConfig().solver, "p3p")
+Settings = Mapping[str, Any]
 Frame = tuple[int, Any, Any]
 """Stamp (ns), CameraInfo and cloud."""
 
@@ -63,33 +59,35 @@ def run(options: Options) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     most = _QUICK_FRAMES if options.quick else None
     print(f"{'medians':56}{_METHODS[0]:>9}{_METHODS[1]:>9}", flush=True)
-    flight, readout_time, true = _simulated(most)
-    answers, found = _localized("Simulated flight", flight, readout_time, true)
+    flight, settings, true = _simulated(most)
+    answers, found = _localized("Simulated flight", flight, settings, true)
     with atomic_files(picture) as (part,):
         errors.draw(found, part)
     webcam = data.path(data.WEBCAM)
     _localized("Webcam over a board", *_recorded(webcam, webcam, most), None)
     if options.all:
         _localized("Walls of markers", *_simulated(most, images=True))
-        _live(flight, answers[_METHODS[0]], readout_time)
+        _live(flight, answers[_METHODS[0]], {**settings, "solver": _METHODS[0]})
     print(f"{picture}\ndone in {time.monotonic() - started:.0f} s")
     print(f"next: {typed('markers', 'make', 'board', '--help')}")
 
 
-def _recorded(path: Path, place: Path, most: int | None) -> tuple[list[Frame], float]:
-    """Return the first frames of a recording, and the readout time (s) that stands in a place."""
+def _recorded(path: Path, place: Path, most: int | None) -> tuple[list[Frame], Settings]:
+    """Return the first frames of a recording, and the settings that stand in a place."""
     frames, info = list[Frame](), None
+    infos, clouds = recording.CAMERA_INFO_TOPIC, recording.CORRESPONDENCES_TOPIC
     with open_bag(path) as bag:
-        for topic, _, message in bag.messages({CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC}):
-            if topic == CAMERA_INFO_TOPIC:
+        for topic, _, message in bag.messages({infos, clouds}):
+            if topic == infos:
                 info = message
             else:
                 frames.append((stamp_ns(message), info, message))
-    return frames[:most], build(load_params_file(place / PARAMETERS)).readout_time
+    settings = load_params_file(place / recording.PARAMETERS)
+    return frames[:most], {**settings, "pose_time": "mid_frame"}
 
 
-def _simulated(most: int | None, images: bool = False) -> tuple[list[Frame], float, Motions]:
-    """Return frames of a flight, or of rendered walls, the readout time (s), and the truth."""
+def _simulated(most: int | None, images: bool = False) -> tuple[list[Frame], Settings, Motions]:
+    """Return frames of a flight, or of rendered walls, their settings, and the truth."""
     start, duration = _WALLS if images else _FLIGHT
     with tempfile.TemporaryDirectory() as place, contextlib.redirect_stdout(io.StringIO()):
         made = matches = Path(place) / "simulated"
@@ -99,19 +97,19 @@ def _simulated(most: int | None, images: bool = False) -> tuple[list[Frame], flo
             exposure=_EXPOSURE if images else 0.0,
         ))  # fmt: skip
         if images:
-            matches, markers = Path(place) / "matches", made / MARKER_MAP
+            matches, markers = Path(place) / "matches", made / recording.MARKER_MAP
             detect_command.detect(detect_command.Options(recording=made, map=markers, out=matches))
         return *_recorded(matches, made, None), read_motions(made)
 
 
 def _localized(
-    title: str, frames: Sequence[Frame], readout_time: float, true: Motions | None
+    title: str, frames: Sequence[Frame], settings: Settings, true: Motions | None
 ) -> tuple[dict[str, dict[int, Localized]], dict[str, dict[str, errors.Errors]]]:
     """Localize the frames by method as a node does, print medians, and return errors, too."""
     answers, rows = dict[str, dict[int, Localized]](), defaultdict[str, list[float]](list)
     off = dict[str, dict[str, errors.Errors]]()
     for solver in _METHODS:
-        localizer, track = CameraFrames(build(_settings(solver, readout_time))), Track()
+        localizer, track = CameraFrames(build({**settings, "solver": solver})), Track()
         answers[solver] = found = dict[int, Localized]()
         with stage(f"{title}, {solver}", len(frames)) as step:
             for stamp, info, cloud in frames:
@@ -133,19 +131,11 @@ def _localized(
     return answers, off
 
 
-def _settings(solver: str, readout_time: float) -> dict[str, Any]:
-    return {"solver": solver, "readout_time": readout_time, "pose_time": "mid_frame"}
-
-
-def _live(frames: Sequence[Frame], answers: Mapping[int, Localized], readout_time: float) -> None:
+def _live(frames: Sequence[Frame], answers: Mapping[int, Localized], settings: Settings) -> None:
     """Localize the flight once more with a live node, and compare."""
     live = importlib.import_module("rs_localizer.ros.live")  # ROS is what nothing else needs
     late, same = list[float](), 0
-    settings = _settings(_METHODS[0], readout_time)
-    with (
-        live.LiveNode(settings, round(0.5e9 * readout_time)) as node,
-        stage("The flight through a live node", len(frames)) as step,
-    ):
+    with live.LiveNode(settings) as node, stage("A live node", len(frames)) as step:
         for stamp, info, cloud in frames:
             began, answer = time.perf_counter(), answers.get(stamp)
             pose = node.localize(info, cloud)

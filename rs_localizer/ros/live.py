@@ -32,12 +32,11 @@ class LiveNode:
     """A localizer and a peer that sends to it; a context manager.
 
     Args:
-        settings: its parameters.
-        delay_ns: time from the stamp of a frame to the stamp of its pose, by these settings.
+        settings: its parameters, with a readout_time, and poses of the middle row.
     """
 
-    def __init__(self, settings: Mapping[str, Any], delay_ns: int) -> None:
-        self._settings, self._delay_ns = settings, delay_ns
+    def __init__(self, settings: Mapping[str, Any]) -> None:
+        self._settings, self._delay_ns = settings, round(0.5e9 * settings["readout_time"])
         self._poses: dict[int, PoseStamped] = {}
 
     def __enter__(self) -> Self:

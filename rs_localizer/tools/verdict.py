@@ -1,15 +1,18 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Words on a calibration: the accepted readout time, and the quality of the lens."""
+"""Words and settings of a calibration: the readout time, and the quality of lens and map."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from rs_localizer.config import CalibrationErrors, NodeConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.scanning import REVERSED, ScanDirection
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.tools.adjust.intrinsics import LensErrors
 from rs_localizer.tools.camera_calibration import CameraCalibration
 from rs_localizer.tools.rig_mounts import Mounted
 
@@ -27,6 +30,26 @@ def scan_direction(result: CameraCalibration) -> ScanDirection:
     """Return the direction that the sign of the readout time means."""
     given = ScanDirection(result.fit.camera.scan_direction)
     return given if result.global_shutter or result.readout_time > 0.0 else REVERSED[given]
+
+
+def deviations(
+    found: Sequence[CameraCalibration], maps: Sequence[MarkerMap], config: NodeConfig
+) -> dict[str, float]:
+    """Return the settings of the deviations of lens and map.
+
+    Args:
+        found: with lenses that were estimated, of which the worst counts; else those that were
+            given hold on.
+    """
+    errors, known = config.calibration, dict[str, float]()
+    if found or errors != CalibrationErrors():
+        for name in LensErrors._fields:
+            own = [float(getattr(each.lens, name)) for each in found] or [getattr(errors, name)]
+            known[f"calibration.{name}"] = float(f"{max(own):.4g}")
+    declared = [each.settings.get("map_deviation", 0.0) for each in maps]
+    if map_deviation := config.map_deviation or max(declared, default=0.0):
+        known["map_deviation"] = float(f"{map_deviation:.3g}")
+    return known
 
 
 def lens_refusal(result: CameraCalibration) -> str:

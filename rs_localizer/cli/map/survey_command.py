@@ -15,12 +15,13 @@ from rs_localizer.cli.options import ResultOptions, UsageError, argument, option
 from rs_localizer.cli.recording_input import ImageOptions, each_image, given_settings
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
-from rs_localizer.markers.families import FAMILIES, Family, family
+from rs_localizer.markers.detection import MarkerDetector
+from rs_localizer.markers.families import FAMILIES, LEAST_SIDE, Family, family
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.markers.prints import Marker
+from rs_localizer.markers.prints import Marker, Pose
 from rs_localizer.tools.mapping.survey import MISFIT, Survey, survey
-from rs_localizer.tools.mapping.unknown_markers import Filmed, Spotted, Spotter, every_marker
+from rs_localizer.tools.mapping.unknown_markers import Filmed, Spotted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +49,7 @@ def run(args: Options) -> None:
     if args.origin is not None and origin is None:
         raise UsageError(f"--origin: {' and '.join(args.family)} have no id {args.origin}")
     refuse_existing(args)
-    filmed = _filmed(args, config, Spotter(markers))
+    filmed = _filmed(args, config, MarkerDetector(MarkerMap(markers), LEAST_SIDE))
     found = survey(filmed, markers, origin=origin)
     _print_result(found, len(filmed.spotted))
     if found.shutter.readout_check is not None:
@@ -82,10 +83,11 @@ def _markers(args: Options) -> tuple[Marker, ...]:
             raise UsageError(f"--size must be metres, or ID[-ID]:metres, got {text!r}") from None
     if not size:
         raise UsageError("--size needs the size of all other markers, too")
-    return every_marker(families, size, sizes)
+    every = [(of.name, id_) for of in families for id_ in range(of.count)]
+    return tuple(Marker.at(name, id_, sizes.get(id_, size), Pose()) for name, id_ in every)
 
 
-def _filmed(args: Options, config: NodeConfig, spotter: Spotter) -> Filmed:
+def _filmed(args: Options, config: NodeConfig, detector: MarkerDetector) -> Filmed:
     """Return the camera and the markers of each image."""
     spotted = dict[int, Spotted]()
     camera: Camera | None = None
@@ -93,7 +95,7 @@ def _filmed(args: Options, config: NodeConfig, spotter: Spotter) -> Filmed:
         if camera is not None and own is not camera:
             raise ValueError("camera_info changes within the recording; cut it there")
         camera, stamp = own, image.stamp_ns
-        spotted[stamp] = spotter.spot(image.pixels, stamp)
+        spotted[stamp] = Spotted.of(detector.detect(image.pixels, stamp), stamp)
     if camera is None:
         raise ValueError(f"{args.recording} has no image that can be read")
     every = [spotted[stamp] for stamp in sorted(spotted)]

@@ -203,20 +203,24 @@ def survey(filmed: Filmed, markers: Sequence[Marker], *, origin: int | None = No
     if origin in done or len(chained.markers) - len(lost) < 2:
         names = ", ".join(marker.name for marker in lost)
         raise ValueError(f"{names}: the corners do not fit those of other markers: {MISFIT}")
-    rest = replace(filmed, spotted=[image.without(done) for image in filmed.spotted])
-    found = survey(rest, markers, origin=origin)
+    rest = []
+    for image in filmed.spotted:
+        others = ~np.isin(image.markers, done)
+        rest.append(replace(image, markers=image.markers[others], quads=image.quads[others]))
+    found = survey(replace(filmed, spotted=rest), markers, origin=origin)
     return replace(found, misfits=lost + found.misfits)
 
 
 def _adjusted(filmed: Filmed, markers: Sequence[Marker], chained: Chained) -> Survey | list[int]:
     """Return the survey, or the markers that do not fit the others."""
-    shown = np.concatenate([filmed.spotted[k].markers for k in chained.images])
+    shown = np.concatenate([filmed.spotted[k].markers for k in chained.poses])
     first_one, *others = chained.markers
     often = [m for m in others if np.count_nonzero(shown == m) >= _LEAST_SIGHTS]
     own, camera, times = [first_one, *often], filmed.camera, filmed.times()
-    rotations = np.array([pose.rotation for pose in chained.poses])
-    positions = np.array([pose.translation for pose in chained.poses])
-    spline = initial_trajectory(times[chained.images], rotations, positions, camera.readout_time)
+    rotations = np.array([pose.rotation for pose in chained.poses.values()])
+    positions = np.array([pose.translation for pose in chained.poses.values()])
+    starts = times[list(chained.poses)]
+    spline = initial_trajectory(starts, rotations, positions, camera.readout_time)
     seen = _observations(filmed, times, markers, chained, own)
     seen = seen.subset(spline.layout.inside(seen.times))
     freedom = Freedom(
@@ -255,7 +259,7 @@ def _adjusted(filmed: Filmed, markers: Sequence[Marker], chained: Chained) -> Su
         covariance, of_the_shape(covariance, corners[order]), tuple(int(counts[k]) for k in order),
         tuple(tuple(markers[m] for m in part) for part in chained.apart),
         tuple(markers[m] for m in chained.markers if m not in {own[k] for k in order}), (), fitted,
-        _shutter(seen, fitted), len(chained.images),
+        _shutter(seen, fitted), len(chained.poses),
     )  # fmt: skip
     if np.mean(done.poor) > 0.5:
         off = np.median(np.linalg.norm(done.deviations_of_shape[:, :PLACE], axis=1))
@@ -341,7 +345,7 @@ def _observations(
     """Return all corners of some markers in the images with a pose, taken at times (g,), s."""
     place = {marker: k for k, marker in enumerate(own)}
     frames, points, pixels = [], [], []
-    for k in chained.images:
+    for k in chained.poses:
         spotted = filmed.spotted[k]
         for marker, quad in zip(spotted.markers.tolist(), spotted.quads, strict=True):
             if marker in place:

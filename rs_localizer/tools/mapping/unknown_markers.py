@@ -10,14 +10,13 @@ agrees for the true poses only; by what agrees most, all are chained.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
@@ -25,10 +24,8 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.transforms import Transform
-from rs_localizer.markers.detection import MarkerDetector
-from rs_localizer.markers.families import LEAST_SIDE, Family
-from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.markers.prints import Marker, Pose
+from rs_localizer.markers.detection import Detections
+from rs_localizer.markers.prints import Marker
 from rs_localizer.tools.mapping.map_keypoints import middle_row_delay
 
 
@@ -40,48 +37,12 @@ class Spotted:
     markers: IntArray  # (m,) places in the list of all markers
     quads: Array  # (m,4,2) raw pixels: top left, top right, bottom right, bottom left
 
-    def without(self, markers: Sequence[int]) -> Spotted:
-        """Return the other markers."""
-        others = ~np.isin(self.markers, markers)
-        return Spotted(self.stamp_ns, self.markers[others], self.quads[others])
-
-
-def every_marker(
-    families: Sequence[Family], size: float, sizes: Mapping[int, float]
-) -> tuple[Marker, ...]:
-    """Return all markers of some families, all of them at the origin.
-
-    Args:
-        families: of different kinds.
-        size: m, side of the black square.
-        sizes: of those ids that differ.
-    """
-    return tuple(
-        Marker.at(family.name, id_, sizes.get(id_, size), Pose())
-        for family in families
-        for id_ in range(family.count)
-    )
-
-
-class Spotter:
-    """Finds markers of some families, whichever they are.
-
-    Raises:
-        MarkerMapError: for families that this OpenCV does not know.
-    """
-
-    def __init__(self, markers: Sequence[Marker]) -> None:
-        self._detector = MarkerDetector(MarkerMap(tuple(markers)), LEAST_SIDE)
-        self._end = 4 * len(markers)
-
-    def spot(self, image: NDArray[np.uint8], stamp_ns: int) -> Spotted:
-        """Return the markers of an image (h,w)."""
-        found = self._detector.detect(image, stamp_ns)
-        ids, rows = np.unique(found.ids[found.ids < self._end], return_index=True)
-        counts = np.bincount(ids // 4)
-        rows = rows[counts[ids // 4] == 4]  # of whole markers
-        quads = found.pixels[found.ids < self._end][rows].reshape(-1, 4, 2)
-        return Spotted(stamp_ns, np.flatnonzero(counts == 4), quads)
+    @classmethod
+    def of(cls, found: Detections, stamp_ns: int) -> Spotted:
+        """Return the markers of an image in which a map of markers alone was looked for."""
+        markers, counts = np.unique(found.ids // 4, return_counts=True)
+        pixels = found.pixels[np.argsort(found.ids)][np.repeat(counts == 4, counts)]
+        return cls(stamp_ns, markers[counts == 4], pixels.reshape(-1, 4, 2))
 
 
 # Images of a pair that are compared, evenly chosen.
@@ -108,9 +69,9 @@ class Filmed:
 
     def times(self) -> Array:
         """Return the times (g,), s since the first stamp, of the images' middle rows."""
-        start_ns = self.spotted[0].stamp_ns
-        stamps = np.array([(image.stamp_ns - start_ns) * 1e-9 for image in self.spotted])
-        return stamps + middle_row_delay(self.camera, self.stamp_offset)
+        stamps = np.array([image.stamp_ns for image in self.spotted], np.int64)
+        delay = middle_row_delay(self.camera, self.stamp_offset)
+        return np.asarray(1e-9 * (stamps - stamps[0]) + delay)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,8 +79,7 @@ class Chained:
     """Markers that hang together, and the images that show them."""
 
     markers: dict[int, Transform]  # origin_from_marker, by place in the list
-    images: list[int]  # places of those with a pose
-    poses: list[Transform]  # origin_from_camera
+    poses: dict[int, Transform]  # origin_from_camera, by place of the image
     apart: list[list[int]]  # markers that do not hang together with these, part by part
 
 
@@ -141,26 +101,25 @@ def chain(filmed: Filmed, markers: Sequence[Marker], origin: int | None) -> Chai
             that hang together.
     """
     views = [_sights(filmed.camera, image, markers) for image in filmed.spotted]
-    seen = sorted({sight.marker for view in views for sight in view})
     between = _between(views, markers)
-    place = {marker: k for k, marker in enumerate(seen)}
-    # SciPy 1.11 has no trees of other indices.
-    pairs = np.array([[place[a], place[b]] for a, b in between], np.int32).reshape(-1, 2)
+    pairs = np.array(list(between), np.int32).reshape(-1, 2)  # SciPy 1.11 has no trees of others
     costs = np.array([1.0 / support for _, support in between.values()])
-    graph = csr_array((costs, (pairs[:, 0], pairs[:, 1])), shape=(len(seen),) * 2)
+    graph = csr_array((costs, (pairs[:, 0], pairs[:, 1])), shape=(len(markers),) * 2)
     tree = minimum_spanning_tree(graph)  # along the best supported chains
-    count, labels = connected_components(tree, directed=False)
-    parts = [[seen[m] for m in np.flatnonzero(labels == k).tolist()] for k in range(count)]
-    parts.sort(key=lambda part: (-len(part), part[0]))
+    _, labels = connected_components(tree, directed=False)
+    groups = defaultdict[int, list[int]](list)
+    for marker in sorted({sight.marker for view in views for sight in view}):
+        groups[labels[marker]].append(marker)
+    parts = sorted(groups.values(), key=lambda part: (-len(part), part[0]))
     first = parts[0][0] if origin is None else origin
-    order, before = breadth_first_order(tree, place[first], directed=False)
+    order, before = breadth_first_order(tree, first, directed=False)
     placed = {first: Transform(np.eye(3), np.zeros(3))}
-    for k in order[1:].tolist():
-        here, there = seen[k], seen[int(before[k])]
+    for here in order[1:].tolist():
+        there = int(before[here])
         step = between[min(here, there), max(here, there)][0]
         placed[here] = placed[there] @ (step if there < here else step.inverse())
-    images, poses = _image_poses(views, filmed.times(), placed, markers)
-    return Chained(placed, images, poses, [part for part in parts if first not in part])
+    poses = _image_poses(views, filmed.times(), placed, markers)
+    return Chained(placed, poses, [part for part in parts if first not in part])
 
 
 def _sights(camera: Camera, image: Spotted, markers: Sequence[Marker]) -> list[_MarkerSight]:
@@ -179,11 +138,8 @@ def _sights(camera: Camera, image: Spotted, markers: Sequence[Marker]) -> list[_
         rotations = Rotation.from_rotvec(np.reshape(turns, (-1, 3))).as_matrix()
         centres = np.reshape(places, (-1, 3)).astype(np.float64)
         fits = np.exp(-(np.ravel(errors) - np.min(errors)) / doubt).tolist()
-        poses = [
-            (Transform(rotation, centre), fit)
-            for rotation, centre, fit in zip(rotations, centres, fits, strict=True)
-            if centre[2] > 0.0
-        ]
+        fitting = zip(map(Transform, rotations, centres), fits, strict=True)
+        poses = [(pose, fit) for pose, fit in fitting if pose.translation[2] > 0.0]
         if poses:
             sights.append(_MarkerSight(marker, rays, poses))
     return sights
@@ -195,9 +151,8 @@ def _between(
     """Return transforms a_from_b of each pair a < b, and the number of images that support them."""
     images = defaultdict[tuple[int, int], list[tuple[_MarkerSight, _MarkerSight]]](list)
     for view in views:
-        for one, other in combinations(sorted(view, key=lambda sight: sight.marker), 2):
-            if one.marker != other.marker:
-                images[one.marker, other.marker].append((one, other))
+        for one, other in combinations(view, 2):  # in the order of their places
+            images[one.marker, other.marker].append((one, other))
     between = {}
     for (a, b), among in images.items():
         said = [
@@ -225,39 +180,35 @@ def _agreed(said: list[tuple[int, Transform, float]], size: float) -> tuple[Tran
     # Of each image only the candidate that agrees best counts.
     firsts = np.flatnonzero(np.diff(image, prepend=-1))
     per_image = np.maximum.reduceat(agree, firsts, axis=1)
-    support = per_image.sum(axis=1)
-    best = int(np.argmax(support))
+    best = int(np.argmax(per_image.sum(axis=1)))
     # The mean of what agrees with it, of each image one.
     weights = agree[best] * (agree[best] == per_image[best][np.searchsorted(image[firsts], image)])
     turn = Rotation.from_matrix(turns).mean(weights).as_matrix()
-    return Transform(turn, weights @ places / weights.sum()), float(support[best])
+    return Transform(turn, weights @ places / weights.sum()), float(per_image[best].sum())
 
 
 def _image_poses(
     views: list[list[_MarkerSight]], times: Array, placed: dict[int, Transform],
     markers: Sequence[Marker],
-) -> tuple[list[int], list[Transform]]:  # fmt: skip
-    """Return images with a pose, and origin_from_camera of each."""
-    images: list[int] = []
-    poses: list[Transform] = []
+) -> dict[int, Transform]:  # fmt: skip
+    """Return origin_from_camera of the images that tell it."""
+    poses = dict[int, Transform]()
     for k, view in enumerate(views):
         own = [(sight, placed[sight.marker]) for sight in view if sight.marker in placed]
         if not own:
             continue
-        points = np.concatenate([
-            markers[of.marker].corners @ place.rotation.T + place.translation for of, place in own
-        ])  # fmt: skip
-        rays = np.concatenate([of.rays for of, _ in own])
+        shapes = [markers[of.marker].corners @ at.rotation.T + at.translation for of, at in own]
+        points, rays = np.concatenate(shapes), np.concatenate([of.rays for of, _ in own])
         options = [pose @ place.inverse() for of, place in own for pose, _ in of.poses]
         costs = np.array([_cost(option, points, rays) for option in options])
         best = options[int(np.argmin(costs))]
-        if images and times[k] - times[images[-1]] < _NEAR:
-            before = poses[-1].rotation
+        last = next(reversed(poses), None)
+        if last is not None and times[k] - times[last] < _NEAR:
+            before = poses[last].rotation
             alike = [options[m] for m in np.flatnonzero(costs <= _ALIKE * costs.min())]
             best = max(alike, key=lambda of: float(np.sum(of.rotation.T * before)))
-        images.append(k)
-        poses.append(best.inverse())
-    return images, poses
+        poses[k] = best.inverse()
+    return poses
 
 
 def _cost(pose: Transform, points: Array, rays: Array) -> float:

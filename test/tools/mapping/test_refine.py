@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.transforms import Transform
-from rs_localizer.markers.families import family
+from rs_localizer.markers.prints import Marker, Pose
 from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.system import Factored
 from rs_localizer.tools.adjust.variables import Freedom, Unknowns
@@ -21,7 +21,7 @@ from rs_localizer.tools.mapping.gauge import of_the_shape, through
 from rs_localizer.tools.mapping.map_keypoints import MapFreedom, MapObservations
 from rs_localizer.tools.mapping.refinement import DRIFT, RefinedMap, Refinement, fit_shutter, refine
 from rs_localizer.tools.mapping.survey import Survey, survey
-from rs_localizer.tools.mapping.unknown_markers import Chained, Filmed, Spotted, chain, every_marker
+from rs_localizer.tools.mapping.unknown_markers import Chained, Filmed, Spotted, chain
 from rs_localizer.tools.readout_belief import ShutterFit
 
 VIDEO = np.arange(0.0, 1.2, 1.0 / 30.0)
@@ -201,7 +201,7 @@ def test_images_that_no_smooth_motion_joins_have_poses_of_their_own():
 
 SIZE = 0.15
 STAMPS = np.arange(0.0, 3.0, 1.0 / 30.0)
-MARKERS = every_marker([family("4x4_50")], SIZE, {})
+MARKERS = [Marker.at("4x4_50", id_, SIZE, Pose()) for id_ in range(50)]
 
 Poses = list[tuple[np.ndarray, np.ndarray]]
 
@@ -285,8 +285,9 @@ def test_a_wrong_readout_time_of_a_survey_is_named(seed, refused):
 @pytest.mark.parametrize("wrong", [{4: 1.04}, {2: 1.1}, {0: 1.3}])
 def test_a_marker_of_another_size_is_named_and_left_out(spotted, poses, wrong):
     """The origin, too, and one that is off by a little: of 20 seeds in 20, 20 and 19."""
-    sizes = {id_: share * SIZE for id_, share in wrong.items()}
-    found = survey(Filmed(camera(), spotted), every_marker([family("4x4_50")], SIZE, sizes))
+    sizes = [wrong.get(id_, 1.0) * SIZE for id_ in range(50)]
+    markers = [Marker.at("4x4_50", id_, size, Pose()) for id_, size in enumerate(sizes)]
+    found = survey(Filmed(camera(), spotted), markers)
     assert [marker.id for marker in found.misfits] == list(wrong)
     assert len(found.markers) == 4
     check(found, poses, 0.03)
@@ -322,7 +323,9 @@ def test_a_readout_time_of_which_the_seconds_disagree_is_known_less(spotted, pos
 def turned_over(chained: Chained, marker: int) -> Chained:
     """The first guess with a marker turned over as its images see it."""
     own = chained.markers[marker]
-    toward = np.mean([pose.translation for pose in chained.poses], axis=0) - own.translation
+    toward = (
+        np.mean([pose.translation for pose in chained.poses.values()], axis=0) - own.translation
+    )
     toward /= np.linalg.norm(toward)
     mirror = np.eye(3) - 2.0 * np.outer(toward, toward)
     turned = Transform(mirror @ own.rotation @ np.diag([1.0, 1.0, -1.0]), own.translation)
@@ -331,7 +334,7 @@ def turned_over(chained: Chained, marker: int) -> Chained:
     return replace(
         chained,
         markers={of: back @ pose for of, pose in markers.items()},
-        poses=[back @ pose for pose in chained.poses],
+        poses={k: back @ pose for k, pose in chained.poses.items()},
     )
 
 
