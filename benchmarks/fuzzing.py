@@ -36,6 +36,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 from tqdm import tqdm
 
@@ -320,11 +321,11 @@ def _with_check_sums(png: bytes) -> bytes:
 def _recordings(folder: Path) -> dict[str, bytes]:
     """Files of recordings by their suffixes: two readings of an IMU each."""
     found = {}
-    for storage, suffix in (("mcap", ".mcap"), ("sqlite3", ".db3")):
-        with BagWriter(folder / storage, storage) as bag:
+    for storage, suffix in ((StoragePlugin.MCAP, ".mcap"), (StoragePlugin.SQLITE3, ".db3")):
+        with BagWriter(folder / storage.name, storage) as bag:
             for stamp_ns in (_STAMP, _STAMP + 10**9):
                 bag.write("/imu", _reading(), stamp_ns)
-        found[suffix] = next((folder / storage).glob(f"*{suffix}")).read_bytes()
+        found[suffix] = next((folder / storage.name).glob(f"*{suffix}")).read_bytes()
     found["metadata.yaml"] = (folder / "mcap" / "metadata.yaml").read_bytes()
     store = get_typestore(Stores.ROS1_NOETIC)
     with Ros1Writer(folder / "right.bag") as writer:

@@ -22,7 +22,7 @@ from rs_localizer.io import rigs
 from rs_localizer.io.camera_files import lens_parameters, write_calibration
 from rs_localizer.io.rigs import RigParts
 from rs_localizer.markers.map_files import write_marker_map
-from rs_localizer.offline.fleet import Figures
+from rs_localizer.offline.tasks import Figures
 from rs_localizer.settings import build, write_parameters
 from rs_localizer.tools import verdict
 from rs_localizer.tools.camera_calibration import (

@@ -28,8 +28,8 @@ from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.recording import PARAMETERS
 from rs_localizer.offline import detect as offline
 from rs_localizer.offline.detect import Extraction, record_features, record_markers
-from rs_localizer.offline.fleet import Figures
 from rs_localizer.offline.image_sources import Carried, Shot
+from rs_localizer.offline.tasks import Figures
 from rs_localizer.pipeline.keypoints import FrameExtractor
 from rs_localizer.pipeline.marker_detector import FrameDetector
 from rs_localizer.settings import build, settings, write_parameters

@@ -13,7 +13,7 @@ from rs_localizer.cli import write_all
 from rs_localizer.cli.options import argument, option
 from rs_localizer.cli.recording_input import remapped
 from rs_localizer.io.trajectories import Trajectory, read_motions
-from rs_localizer.offline.fleet import Figures
+from rs_localizer.offline.tasks import Figures
 from rs_localizer.tools import errors
 
 _TOPICS = ("pose", "twist", "truth_pose", "truth_twist")

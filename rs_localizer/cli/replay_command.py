@@ -25,11 +25,11 @@ from rs_localizer.io.recording import BRIDGED, CAMERA, MAP, MAP_FRAME, PARAMETER
 from rs_localizer.io.topics import IMU
 from rs_localizer.io.trajectories import POSES_FILE, TWISTS_FILE
 from rs_localizer.markers.map_files import is_marker_file
-from rs_localizer.offline import fleet, frame_table
-from rs_localizer.offline.fleet import Figures, Outcome, Task
+from rs_localizer.offline import fleet, frame_table, tasks
 from rs_localizer.offline.image_sources import holds_images, image_topics
 from rs_localizer.offline.replay import has_frames, imu_topics, prepare_replay
 from rs_localizer.offline.results import Smooth, Tally, figures, summary, write_results
+from rs_localizer.offline.tasks import Figures, Outcome, Task
 from rs_localizer.settings import build
 
 # The table of each of many recordings.
@@ -168,7 +168,7 @@ def _replay_matches(options: Options, path: Path, recording: Path, out: Path, ti
         if options.parquet is not None:
             tally.table = frame_table.FrameTable(recording, localizer, options.smooth)
         # Other files of the user stay.
-        names = POSES_FILE, TWISTS_FILE, BRIDGED, RESULT, fleet.MARKER, fleet.LOG
+        names = POSES_FILE, TWISTS_FILE, BRIDGED, RESULT, tasks.MARKER, tasks.LOG
         earlier = earlier_result(options, f"{RESULT}/metadata.yaml", out, names)
         with (
             atomic_directory(out, earlier) as built,
@@ -219,28 +219,28 @@ def _replay_all(options: Options) -> None:
     )  # fmt: skip
     changed = [file.stat().st_mtime_ns for file in files if file is not None]
     work = functools.partial(_replay_of_many, own)
-    tasks = fleet.tasks_of(options.recordings, out.absolute(), work, repr((own, changed)))
+    every = tasks.tasks_of(options.recordings, out.absolute(), work, repr((own, changed)))
     if not options.overwrite:
-        fleet.refuse_others(tasks)
-    left = sum(fleet.finished(task) is None for task in tasks)
-    print(f"{len(tasks) - left} of {len(tasks)} recordings have been done before")
+        tasks.refuse_others(every)
+    left = sum(tasks.finished(task) is None for task in every)
+    print(f"{len(every) - left} of {len(every)} recordings have been done before")
     with tqdm(total=left, unit="recording", disable=None) as bar:
 
         def heard(task: Task, outcome: Outcome) -> None:
             bar.update()
             bar.write(f"{task.folder.name}: {outcome if isinstance(outcome, str) else 'done'}")
 
-        outcomes = fleet.do_all(tasks, out, options.scheduler, options.workers, heard)
-    print(f"written to {out / fleet.SUMMARY}")
-    done = [task for task in tasks if not isinstance(outcomes[task.folder], str)]
+        outcomes = fleet.do_all(every, out, options.scheduler, options.workers, heard)
+    print(f"written to {out / tasks.SUMMARY}")
+    done = [task for task in every if not isinstance(outcomes[task.folder], str)]
     if options.parquet is not None:
         from pyarrow.parquet import read_table
 
         tables = [read_table(task.folder / TABLE) for task in done]
         print(frame_table.write_parquet(tables, options.parquet))
-    if failed := len(tasks) - len(done):
+    if failed := len(every) - len(done):
         raise ValueError(
-            f"{failed} of {len(tasks)} recordings failed; {out / fleet.SUMMARY} says why"
+            f"{failed} of {len(every)} recordings failed; {out / tasks.SUMMARY} says why"
         )
 
 

@@ -26,7 +26,7 @@ from rs_localizer.io.camera_files import pinhole_matrix, read_calibration
 from rs_localizer.io.maps.files import write_npz
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.recording import MAP, MAP_FRAME, MARKER_MAP, PARAMETERS
-from rs_localizer.io.rigs import read_camchain
+from rs_localizer.io.rigs import node_parameters, read_camchain
 from rs_localizer.io.topics import TF_STATIC
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.markers.map_files import write_marker_map
@@ -53,11 +53,11 @@ from rs_localizer.tools.simulation.simulated_imu import (
     write_imu,
 )
 from rs_localizer.tools.simulation.simulated_recording import (
+    RIG_FRAME,
     camera_stamps,
     keypoint_rows,
     make_mounts,
     random_descriptors,
-    rig_parameters,
     simulate_rig,
     write_rig_frame,
     write_simulated,
@@ -300,7 +300,7 @@ class _Recorder:
             total = sum(map(len, stamps.values()))
             for image in tqdm(images, "simulate", total, unit="image", disable=None):
                 write_rig_frame(bag, parts, motion, image, self._keypoints(image.frame))
-        return rig_parameters(parts)
+        return {**node_parameters(parts), "base_frame": RIG_FRAME}
 
     def print_result(self) -> dict[str, object]:
         """Say what was written, and what comes next."""

@@ -27,7 +27,6 @@ from rs_localizer.io import detections
 from rs_localizer.io.topics import TF_STATIC
 
 _METADATA, _SUFFIXES = "metadata.yaml", (".mcap", ".db3", ".bag")
-STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 # Players advertise topics with the QoS recorded in the bag; subscribers to /tf_static expect
 # transient-local durability.
 _NO_LIMIT = qos.QosTime(2**31 - 1, 10**9 - 1)
@@ -231,19 +230,17 @@ class BagWriter:
 
     Args:
         path: the directory to create.
-        storage: ``mcap`` or ``sqlite3``.
+        storage: kind of its files.
 
     Raises:
         BagError: when the path exists, cannot be created, or its disk takes no more.
     """
 
-    def __init__(self, path: Path | str, storage: str = "mcap") -> None:
-        if storage not in STORAGES:
-            raise BagError(f"storage must be one of {', '.join(STORAGES)}; got {storage!r}")
+    def __init__(self, path: Path | str, storage: StoragePlugin = StoragePlugin.MCAP) -> None:
         self._path = Path(path)
         self._connections: dict[str, Any] = {}
         try:
-            self._writer = Writer(self._path, version=9, storage_plugin=STORAGES[storage])
+            self._writer = Writer(self._path, version=9, storage_plugin=storage)
         except WriterError:
             raise BagError(f"{self._path} exists already; it is not overwritten") from None
 

@@ -1,34 +1,29 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Many recordings: one function, mapped over them here or by Dask; finished ones are skipped."""
+"""The tasks of many recordings, mapped by Dask or done here; finished ones are skipped."""
 
 import contextlib
-import csv
 import io
 import json
 import logging
 import socket
-from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass
-from importlib.metadata import version
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Any
 
-from rs_localizer.io.atomic_files import atomic_directory, atomic_files, content, write_errors
+from rs_localizer.io.atomic_files import atomic_directory, content, write_errors
+from rs_localizer.offline.tasks import (
+    LOG,
+    MARKER,
+    SUMMARY,
+    VERSION,
+    Outcome,
+    Task,
+    finished,
+    summarize,
+)
 from rs_localizer.process import ignore_working_folder
 
-Figures = dict[str, float | int | str]
-"""Figures of a recording, by identifiers with their units."""
-
-Outcome = Figures | str
-"""Figures of a task that is done; of one that failed, why, in one line."""
-
-MARKER, LOG = "fleet.json", "log.txt"
-"""In each complete result: what it is of, written last; and what the command would have said."""
-SUMMARY = "summary.csv"
-"""A row of each recording."""
-
-_PACKAGE = "rs_localizer"
 # Scheduler that answers nothing for so long is none, s.
 _CONNECT_TIMEOUT = 5.0
 # Level of what Dask logs: what goes wrong is an outcome or an error.
@@ -43,41 +38,6 @@ logging.getLogger("distributed").setLevel({_SILENT})
 """
 
 
-@dataclass(frozen=True, slots=True)
-class Task:
-    """One recording, and what its result is made with."""
-
-    work: Callable[[Path, Path], Figures]  # of a recording, and the folder to create; pickled
-    recording: Path  # absolute, as the folder: workers are elsewhere
-    folder: Path
-    settings: str  # version and options, as text
-
-
-def tasks_of(
-    recordings: Sequence[Path], out: Path, work: Callable[[Path, Path], Figures], settings: str
-) -> list[Task]:
-    """Return a task for each different recording, with a folder of its own below ``out``."""
-    made = dict[str, Task]()
-    places = {path.absolute(): path.name if path.is_dir() else path.stem for path in recordings}
-    for place, name in places.items():
-        if list(places.values()).count(name) > 1:
-            name = f"{place.parent.name}_{name}"
-        while name in made:
-            name += "_"
-        made[name] = Task(work, place, out / name, f"{version(_PACKAGE)} {settings}")
-    return list(made.values())
-
-
-def finished(task: Task) -> Figures | None:
-    """Return the figures of a complete result of just this task; None if there is none."""
-    try:
-        about = json.loads((task.folder / MARKER).read_text(encoding="utf-8"))
-        of = about["recording"], about["settings"]
-        return dict(about["figures"]) if of == (str(task.recording), task.settings) else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
 def perform_task(task: Task) -> Outcome:
     """Do a task, unless it has been done; its folder is there afterwards, whole, or not at all.
 
@@ -85,7 +45,7 @@ def perform_task(task: Task) -> Outcome:
     """
     ignore_working_folder()  # of a worker of Dask, which another program has started
     here, said = socket.gethostname(), io.StringIO()
-    if not task.settings.startswith(f"{version(_PACKAGE)} "):
+    if not task.settings.startswith(f"{VERSION} "):
         return f"the worker on {here} has another rs_localizer: install the same"
     if not task.folder.parent.is_dir():
         return f"the worker on {here} does not see {task.folder.parent}"
@@ -121,18 +81,15 @@ def perform_all(
     if scheduler is None and workers is None:
         yield from ((task, perform_task(task)) for task in tasks)
         return
-    import dask.config
     from distributed import Client, KilledWorker, LocalCluster, as_completed
 
     for name in _LOGGERS:
         logging.getLogger(name).setLevel(_SILENT)
     with contextlib.ExitStack() as stack:
-        place: Any = scheduler
-        if scheduler is None:
-            stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": 0}))
-            place = stack.enter_context(LocalCluster(
-                n_workers=workers, threads_per_worker=1, dashboard_address=None, preload=_PRELOAD
-            ))  # fmt: skip
+        place = scheduler or stack.enter_context(LocalCluster(
+            n_workers=workers, threads_per_worker=1, dashboard_address=None, preload=_PRELOAD,
+            scheduler_kwargs={"allowed_failures": 0},
+        ))  # fmt: skip
         try:
             client = stack.enter_context(Client(place, timeout=_CONNECT_TIMEOUT))
         except (OSError, ValueError) as error:
@@ -157,16 +114,6 @@ def _outcome(future: Any) -> Outcome:
     return f"lost: {' '.join(str(error).split())[:200]}"
 
 
-def refuse_others(tasks: Sequence[Task]) -> None:
-    """Raise ``ValueError`` for a folder that is there, and no result of its task."""
-    for task in tasks:
-        if content(task.folder) and finished(task) is None:
-            raise ValueError(
-                f"{task.folder} exists and is no result of this recording, settings and version; "
-                "choose another --out, or --overwrite"
-            )
-
-
 def do_all(
     tasks: Sequence[Task], out: Path, scheduler: str | None, workers: int | None,
     heard: Callable[[Task, Outcome], object],
@@ -187,21 +134,5 @@ def do_all(
     finally:
         for task in tasks:  # done before, or not heard of, as after Ctrl-C
             outcomes.setdefault(task.folder, finished(task) or "not done")
-        _summarize({task: outcomes[task.folder] for task in tasks}, out / SUMMARY)
+        summarize({task: outcomes[task.folder] for task in tasks}, out / SUMMARY)
     return outcomes
-
-
-def _summarize(outcomes: Mapping[Task, Outcome], file: Path) -> None:
-    """Write the table, which is the same with any number of workers and in any order."""
-    known = [{} if isinstance(outcome, str) else outcome for outcome in outcomes.values()]
-    columns = list(dict.fromkeys(name for figures in known for name in figures))
-    with atomic_files(file) as (part,), part.open("w", encoding="utf-8", newline="") as text:
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(["recording", "folder", *columns, "reason"])
-        for (task, outcome), figures in zip(outcomes.items(), known, strict=True):
-            values = [figures.get(name, "") for name in columns]
-            cells = [f"{v:.6g}" if isinstance(v, float) else str(v) for v in values]
-            reason = outcome if isinstance(outcome, str) else ""
-            row = [str(task.recording), task.folder.name, *cells, reason]
-            # Text that a spreadsheet does not take for a formula.
-            writer.writerow([f"'{cell}" if cell[:1] in ("=", "+", "@") else cell for cell in row])

@@ -39,9 +39,9 @@ from rs_localizer.io.trajectories import (
     write_twists,
 )
 from rs_localizer.io.transforms import TransformError, make_transform
-from rs_localizer.offline.fleet import Figures
 from rs_localizer.offline.frame_table import FrameTable
 from rs_localizer.offline.replay import NO_FRAMES, TF_TYPE, Answer, Topics, replay
+from rs_localizer.offline.tasks import Figures
 from rs_localizer.pipeline.aid import AidInput
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.map_to_odom import CorrectionState

@@ -19,7 +19,8 @@ import pytest
 
 from rs_localizer.cli.commands import main
 from rs_localizer.offline import fleet
-from rs_localizer.offline.fleet import Outcome, Task, do_all, perform_task, tasks_of
+from rs_localizer.offline.fleet import do_all, perform_task
+from rs_localizer.offline.tasks import Outcome, Task, tasks_of
 
 SHUTTER = ["-p", "readout_time:=0.03"]
 

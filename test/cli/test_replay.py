@@ -13,11 +13,12 @@ import pytest
 import recorded
 from numpy.lib.recfunctions import repack_fields
 from recorded import CAMERA, READOUT_TIME, SHUTTER, flight, record, tf, write_mp4, write_ros1
+from rosbags.rosbag2 import StoragePlugin
 from scipy.spatial.transform import Rotation
 
 from benchmarks.fuzzing import map_rows
 from rs_localizer.cli.commands import main
-from rs_localizer.io.bags import STORAGES, BagWriter, make_message, open_bag
+from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.camera_files import write_calibration
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import make_cloud
@@ -117,8 +118,8 @@ def test_every_kind_of_recording_gives_the_same(recording, tmp_path):
     inputs = [message for message in messages(recording) if not message[0].startswith("/truth")]
     place = (0.5, 0.2, 0.9), Rotation.from_euler("x", -90.0, degrees=True)
     mounting = ("/tf_static", START, tf("base_link", "camera_optical_frame", *place))
-    for name in STORAGES:
-        with BagWriter(tmp_path / name, name) as bag:
+    for kind in StoragePlugin:
+        with BagWriter(tmp_path / kind.name, kind) as bag:
             for topic, stamp_ns, message in (mounting, *sorted(inputs, key=lambda it: it[0][::-1])):
                 bag.write(topic, message, stamp_ns if topic != "/camera_info" else 2 * START)
     # ROS 1 before tf2: another type, slashes before the names, and the mounting on /tf.
@@ -126,8 +127,8 @@ def test_every_kind_of_recording_gives_the_same(recording, tmp_path):
         ("/tf", START + later, tf("/base_link", "/camera_optical_frame", *place, START + later))
         for later in (-(10**9), 10**9)
     ]
-    one_file = next((tmp_path / "mcap").glob("*.mcap"))
-    bags = [*(tmp_path / name for name in STORAGES), one_file]
+    one_file = next((tmp_path / "MCAP").glob("*.mcap"))
+    bags = [*(tmp_path / kind.name for kind in StoragePlugin), one_file]
     bags.append(write_ros1(tmp_path / "old.bag", [*inputs, *old]))
     texts = []
     for i, bag in enumerate(bags):

@@ -12,16 +12,16 @@ import numpy as np
 from rs_localizer import data
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter
-from rs_localizer.io.rigs import RigParts
+from rs_localizer.io.rigs import RigParts, node_parameters
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import write_parameters
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import FrameSettings, simulate_frames
 from rs_localizer.tools.simulation.simulated_recording import (
+    RIG_FRAME,
     RigFrame,
     camera_stamps,
     make_mounts,
-    rig_parameters,
     simulate_rig,
     write_rig_frame,
 )
@@ -95,5 +95,5 @@ def record(
         for image in simulate_rig(true, motion, see):
             if keep(image):
                 write_rig_frame(bag, PARTS, motion, image)
-    write_parameters(path / "parameters.yaml", rig_parameters(PARTS))
+    write_parameters(path / "parameters.yaml", {**node_parameters(PARTS), "base_frame": RIG_FRAME})
     return motion

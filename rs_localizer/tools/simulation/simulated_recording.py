@@ -13,7 +13,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
-from rs_localizer.io.maps.landmarks import Descriptors, Map
+from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import make_header, make_quaternion, make_vector
 from rs_localizer.io.recording import (
     CAMERA_FRAME,
@@ -26,7 +26,7 @@ from rs_localizer.io.recording import (
     make_correspondences,
     make_image,
 )
-from rs_localizer.io.rigs import RigParts, node_parameters
+from rs_localizer.io.rigs import RigParts
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.tools.simulation.renderer import FORMAT, RenderedFrame
 from rs_localizer.tools.simulation.simulated_frames import SimulatedFrame, frame_stamps
@@ -34,8 +34,6 @@ from rs_localizer.tools.simulation.true_motion import TrueMotion, TrueState
 
 # Share of the bits that differ between two views of a landmark; ORB's median is about this.
 BIT_ERRORS = 0.1
-# Noise of each number of a descriptor whose numbers have the deviation 1.
-DEVIATION = 0.3
 
 
 def random_descriptors(count: int, rng: np.random.Generator, width: int = 32) -> NDArray[np.uint8]:
@@ -43,17 +41,8 @@ def random_descriptors(count: int, rng: np.random.Generator, width: int = 32) ->
     return rng.integers(0, 256, (count, width), dtype=np.uint8)
 
 
-def seen_descriptors(descriptors: Descriptors, rng: np.random.Generator) -> Descriptors:
-    """Return the descriptors (n,width) as another image has them."""
-    count, width = descriptors.shape
-    if descriptors.dtype == np.uint8:
-        flips: NDArray[np.uint8] = np.packbits(rng.random((count, 8 * width)) < BIT_ERRORS, axis=1)
-        return descriptors.astype(np.uint8) ^ flips
-    return (descriptors + rng.normal(0.0, DEVIATION, (count, width))).astype(np.float32)
-
-
 def keypoint_rows(frame: SimulatedFrame, landmarks: Map, rng: np.random.Generator) -> NDArray[Any]:
-    """Return rows (n,) of a cloud of keypoints: pixels, and ids or descriptors of landmarks.
+    """Return rows (n,) of a cloud of keypoints: pixels, ids or binary descriptors of landmarks.
 
     Outliers of the frame have the mark of a landmark and the pixel of something else, as wrong
     matches do.
@@ -61,15 +50,15 @@ def keypoint_rows(frame: SimulatedFrame, landmarks: Map, rng: np.random.Generato
     kinds: list[tuple[Any, ...]] = [("u", "<f4"), ("v", "<f4")]
     if landmarks.ids is not None:
         kinds.append(("id", landmarks.id_type))
-    if landmarks.descriptors is not None:
-        descriptors = landmarks.descriptors
+    if (descriptors := landmarks.descriptors) is not None:
         kinds.append(("descriptor", descriptors.dtype, descriptors.shape[1:]))
     rows = np.empty(len(frame.ids), kinds)
     rows["u"], rows["v"] = frame.pixels.T
     if landmarks.ids is not None:
         rows["id"] = landmarks.ids[frame.ids]
-    if landmarks.descriptors is not None:
-        rows["descriptor"] = seen_descriptors(landmarks.descriptors[frame.ids], rng)
+    if descriptors is not None:
+        flips = rng.random((len(frame.ids), 8 * descriptors.shape[1])) < BIT_ERRORS
+        rows["descriptor"] = np.bitwise_xor(descriptors[frame.ids], np.packbits(flips, axis=1))
     return rows
 
 
@@ -86,12 +75,11 @@ def write_simulated(
     Args:
         later_ns: from the time of a message to when it is recorded.
     """
-    stamp_ns, middle_ns = frame.stamp_ns, frame.middle_ns
-    for topic, message in view_messages(camera, frame, stamp_ns, keypoints).items():
-        bag.write(topic, message, stamp_ns + later_ns)
-    write_truth(bag, stamp_ns, frame.first_row, recorded_ns=stamp_ns + later_ns)
-    if middle_ns != stamp_ns:
-        write_truth(bag, middle_ns, frame.middle_row, recorded_ns=middle_ns + later_ns)
+    for topic, message in view_messages(camera, frame, frame.stamp_ns, keypoints).items():
+        bag.write(topic, message, frame.stamp_ns + later_ns)
+    truths = {frame.stamp_ns: frame.first_row, frame.middle_ns: frame.middle_row}
+    for time_ns, state in truths.items():
+        write_truth(bag, time_ns, state, CAMERA_FRAME, time_ns + later_ns)
 
 
 def view_messages(
@@ -116,9 +104,8 @@ def view_messages(
 
 
 def write_truth(
-    bag: BagWriter, stamp_ns: int, state: TrueState, body: str = CAMERA_FRAME,
-    recorded_ns: int | None = None,
-) -> None:  # fmt: skip
+    bag: BagWriter, stamp_ns: int, state: TrueState, body: str, recorded_ns: int
+) -> None:
     """Write pose and twist of a body in the map, recorded at its time or another."""
     pose = make_message(
         "geometry_msgs/msg/Pose",
@@ -127,7 +114,6 @@ def write_truth(
     )
     linear, angular = (make_vector(make_message, of[0]) for of in (state.linear, state.angular))
     twist = make_message("geometry_msgs/msg/Twist", linear=linear, angular=angular)
-    recorded_ns = stamp_ns if recorded_ns is None else recorded_ns
     for topic, kind, frame, name, value in (
         (TRUE_POSE_TOPIC, "PoseStamped", MAP_FRAME, "pose", pose),
         (TRUE_TWIST_TOPIC, "TwistStamped", body, "twist", twist),
@@ -223,11 +209,6 @@ def simulate_rig(
         offset_ns = round(parts.time_offset.get(name, 0.0) * 1e9)
         for frame in see(name, mounted, 1000 * place):
             yield RigFrame(name, frame.stamp_ns - offset_ns, frame)
-
-
-def rig_parameters(parts: RigParts) -> dict[str, Any]:
-    """Return the node's parameters for a recording of the rig."""
-    return {**node_parameters(parts), "base_frame": RIG_FRAME}
 
 
 def write_rig_frame(

@@ -179,11 +179,9 @@ def three_walls(path: TrueState) -> Scene:
     for (columns, rows, side, right, up, middle), light in zip(walls, _LIGHTS, strict=True):
         frame = axes @ np.column_stack([right, up, np.cross(right, up)])
         pose = Pose(axes @ middle, frame)
-        size = scale * side
-        gap = _GAP * size
-        made = wall(_FAMILY, (columns, rows), size, gap, first_id=len(markers), pose=pose)
-        planes.append(_marker_plane(pose, columns, rows, size, len(markers), light))
-        markers += made
+        size, first_id = scale * side, len(markers)
+        planes.append(_marker_plane(pose, columns, rows, size, first_id, light))
+        markers += wall(_FAMILY, (columns, rows), size, _GAP * size, first_id=first_id, pose=pose)
     return Scene(tuple(planes), MarkerMap(tuple(markers)))
 
 
@@ -241,13 +239,11 @@ def printed(white: NDArray[np.bool_], light: tuple[int, int], texels: int) -> Im
 
 
 def _picture(
-    axes: Array, corner: Array, right: Array, down: Array | list[float], size: Array, seed: int
+    axes: Array, corner: Array, right: Array, down: Array, size: Array, seed: int
 ) -> TexturedPlane:
     width, height = (max(2, round(length / _PICTURE_TEXEL)) for length in size)
     texture = collage(width, height, np.random.default_rng(seed))
-    return TexturedPlane(
-        axes @ corner, axes @ right, axes @ np.asarray(down), _PICTURE_TEXEL, texture
-    )
+    return TexturedPlane(axes @ corner, axes @ right, axes @ down, _PICTURE_TEXEL, texture)
 
 
 SCENES = {"three": three_walls, "room": room}
