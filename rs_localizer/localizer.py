@@ -350,12 +350,7 @@ class Localizer:
         # 3. A global-shutter start, then hypotheses of the solver (LO-RANSAC).
         best = self._search.find(observed)
         if not best.found:
-            most = int(np.bincount(observed.observations.camera).max(initial=0))
-            return Failure(
-                Reason.NO_HYPOTHESIS,
-                f"no three points gave a pose: {most} at most are of one camera, or on one side of "
-                "a cube about a wide one",
-            )
+            return Failure(Reason.NO_HYPOTHESIS, "no three points of one camera gave a pose")
         if self.config.refinement == RefinementKind.NONE:
             return self._minimal(observed, best)
         # 4. Maximum a posteriori on the inliers; rest or motion; the leans of a plane.
@@ -430,7 +425,14 @@ class Localizer:
             # As long as the noise fills the gate, nobody knows how much it is.
             if gate < most and noise_fills(posterior, gate, rolling):
                 gate = min(max(GATE / WIDEST_GATE * posterior.noise, _LEAST_WIDER * gate), most)
-            elif gate < most and searched and by_chance(observed, posterior, threshold) is not None:
+            elif (
+                gate < most
+                and searched
+                and (
+                    np.count_nonzero(posterior.inliers) < self.config.min_inliers
+                    or by_chance(observed, posterior, gate) is not None
+                )
+            ):
                 gate = most  # some of few points that vibrate fit a motion without vibration
             elif rolling and noise_fills(posterior, threshold, rolling):
                 return self._of_rough_map(observed, posterior, terms, assumed)

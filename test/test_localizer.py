@@ -14,13 +14,14 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 import rs_localizer as rsl
 from benchmarks.independent.cameras import Camera, Scan
 from rs_localizer.config import NodeConfig
 from rs_localizer.solvers.table import SOLVERS
 
-from .moving import Moving, camera_of, resting, shown
+from .moving import Moving, camera_of, resting, shown, squared
 
 TRUE = Camera(focal=600.0, distortion=(-0.1, 0.02, 0.001, 0.001, 0.0))
 READOUT = TRUE.readout_time
@@ -225,6 +226,29 @@ def test_random_matches_have_no_pose():
         assert result.reason == rsl.Reason.RESIDUAL or (
             "8 are needed" in result.detail or "fit by chance" in result.detail
         )
+
+
+def test_few_points_with_much_noise_have_a_pose_that_says_so():
+    squares = []
+    for seed in range(24):
+        path = Path(seed, turn=0.5, speed=0.5)
+        points, pixels, _ = frame(path, 8 + seed % 3, 3.0, seed=seed)
+        found = rsl.Localizer(camera()).localize(points, pixels)
+        if found:
+            squares.append(squared(path.error(found, 0.0)[:6], found.covariance))
+    assert len(squares) > 21
+    assert np.mean(np.array(squares) < chi2.ppf(0.95, 6)) > 0.85
+
+
+def test_near_and_far_points_together_have_a_pose():
+    rng = np.random.default_rng(1)
+    for seed in range(60):
+        path = Path(seed, turn=0.5, speed=0.1)
+        depth = np.where(np.arange(150) < 75, 0.15, 100.0) * rng.uniform(0.7, 1.0, 150)
+        local = np.column_stack([rng.uniform(-0.45, 0.45, (150, 2)), np.ones(150)])
+        (rotation,), (position,) = path.pose([0.0])
+        points = rotation.apply(local * depth[:, None]) + position
+        assert rsl.Localizer(camera()).localize(*path.frame(0.0, points, 150, 0.5, seed=seed))
 
 
 RNG = np.random.default_rng(0)

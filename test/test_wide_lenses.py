@@ -72,3 +72,14 @@ def test_points_beyond_90_degrees_are_as_good_as_others(lens):
     assert np.mean(used) > 0.95
     assert np.mean(np.array(squares) < chi2.ppf(0.95, 6)) > 0.8
     assert np.mean(squares) < 9.0  # 6 is as claimed
+
+
+def test_eight_points_all_around_have_a_pose():
+    rng, localizer, squares = np.random.default_rng(3), rsl.Localizer(camera("equidistant")), []
+    for _ in range(30):  # of some, no side of a cube about the camera shows three
+        points, pixels, motion, _ = frame(rng, "equidistant", 100, 0.1)
+        some = rng.choice(len(points), 8, replace=False)
+        result = localizer.localize(points[some], pixels[some])
+        assert result
+        squares.append(squared(error_of(result, motion)[:6], result.covariance))
+    assert max(squares) < 25.0

@@ -135,12 +135,11 @@ def left_out(
     found, left = int(np.count_nonzero(inliers)), int(np.count_nonzero(rest))
     wide = posterior.gate > _WIDE * threshold  # for noise, or for what another matrix explains
     failure = None if known else by_chance(observed, posterior, threshold)
+    if not known and (failure is not None or wide or 2 * found < len(inliers)):
+        in_order = reordered(search, observed, threshold)
+        failure = failure if in_order is None else in_order
     if failure is not None:
         return LeftOut(failure)
-    if not known and (wide or 2 * found < len(inliers)):
-        failure = reordered(search, observed, threshold)
-        if failure is not None:
-            return LeftOut(failure)
     # A principal point alone may point to another image.
     most = _BENT_OFF_CENTRE if off_centre(observed.exposure.cameras[0]) else BENT
     bent = posterior.model_error > most * promised(posterior)
@@ -455,14 +454,16 @@ def by_chance(observed: Observed, posterior: Posterior, threshold: float) -> Fai
     # Of a rough map, or a short focal length, the gate may be as wide: others need room beside it.
     circle = max((GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length) ** 2, 4.0 * gate)
     near = int(np.count_nonzero(errors <= circle))
-    total, area = near, circle
+    total, area, sample = near, circle, PARAMETERS // 2
     if posterior.gate > _WIDE * threshold:
         total, area = len(errors), _area(observed) / math.pi
+        # Such errors decide few numbers of a motion; the others are as they are expected.
+        sample = min(max(math.ceil(found - 0.5 * posterior.freedom), _OF_POSE), sample)
     elif near <= found + _MARKER:
         return None
     # One point may fill the gate, as a near one does of a rough map: so many others fit better.
     best, sizes = np.sort(fitting), (found, 3 * found // 4, found // 2)
-    chances, sample = best / area, PARAMETERS // 2
+    chances = best / area
     surprises = [_surprise(total, k, sample, float(chances[k - 1])) for k in sizes if k]
     if max(surprises, default=0.0) > _LEAST_CHANCE:
         return None

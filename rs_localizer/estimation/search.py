@@ -30,6 +30,7 @@ from rs_localizer.core.arrays import (
 from rs_localizer.core.blocks import write
 from rs_localizer.core.rig import Mounts
 from rs_localizer.core.state import STATE_SIZE, rotation_of
+from rs_localizer.core.types import altered
 from rs_localizer.estimation.points import Observations, Observed, leaning_less, plane_of
 from rs_localizer.estimation.prior import PriorTerms, held_terms
 from rs_localizer.estimation.projection import truncated_cost
@@ -47,6 +48,8 @@ def generator(seed: int) -> Random:
 # A sample whose rows lie closer together than this part of all rows hardly sees the motion.
 _LEAST_ROW_SPREAD = 0.25
 _MOST_REDRAWS = 8
+# Sides of one camera differ in their centres (m) by rounding.
+_ONE_PLACE = 1e-9
 # Number of samples after which a ranked pool is drawn from as a whole (T_N of the PROSAC paper).
 _RANKED_HORIZON = 200_000
 
@@ -75,13 +78,14 @@ class Pool(NamedTuple):
 
 
 def pools_of(
-    observations: Observations, size: int, among: BoolArray, ranking: IntArray, also_all: bool
+    sides: IntArray, size: int, among: BoolArray, ranking: IntArray, also_all: bool
 ) -> list[Pool]:
-    """Return a pool for each camera with enough points for a sample.
+    """Return a pool for each side with enough points for a sample.
 
     Half of the samples ignore the scores, so that wrong ones cost a factor of two at most.
 
     Args:
+        sides: (n,) of a camera, or cameras, by which each point is seen.
         size: of a sample.
         among: (n,) which points to take.
         ranking: points from the best to the worst; empty: they are alike.
@@ -93,13 +97,26 @@ def pools_of(
         groups.insert(0, (ranking if also_all else ranking[among[ranking]], size))
     if also_all:
         groups.insert(0, (chosen, 0))
-    count = len(observations.mounts.axes)
+    count = int(sides.max(initial=0)) + 1
     for place in range(count):
         for points, ranked in groups:
-            own = points[observations.camera[points] == place] if count > 1 else points
+            own = points[sides[points] == place] if count > 1 else points
             if len(own) >= size:
                 pools.append(Pool.of(own, len(own) / len(points), ranked))
     return pools
+
+
+def views_of(observations: Observations, solver: Solver) -> IntArray:
+    """Return what sees each point (n,) for a solver: a side, or if rows do not matter, a camera.
+
+    A camera is the first of its sides, which are at one place.
+    """
+    mounts, sides = observations.mounts, observations.camera
+    if solver.rolling_shutter or len(mounts.axes) == 1:
+        return sides
+    apart = np.abs(mounts.centres[:, None] - mounts.centres).max(axis=2)
+    first = (apart < _ONE_PLACE).argmax(axis=1)
+    return first[sides] if len(set(first.tolist())) < len(first) else sides
 
 
 @inlined
@@ -246,6 +263,32 @@ class Candidate(NamedTuple):
 NOTHING = Candidate(np.zeros(STATE_SIZE), math.inf)
 
 
+def _across(seen: Observations, samples: IntArray) -> tuple[Observations, IntArray]:
+    """Return the points of samples (h,3), each seen by a side of its own, and where they are (h,3).
+
+    The plane through the tips of three bearings is the image of a side that looks along its normal:
+    they lie before it, whichever sides of one camera saw them.
+    """
+    chosen, count = samples.ravel(), len(samples)
+    side = seen.camera[chosen]
+    bearings = np.column_stack([seen.rays[chosen], np.ones(len(chosen))])
+    bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+    bearings = np.einsum("nij,ni->nj", seen.mounts.axes[side], bearings).reshape(count, 3, 3)
+    along = bearings[:, 1] - bearings[:, 0]
+    normal = np.cross(along, bearings[:, 2] - bearings[:, 0])
+    normal *= np.sign(np.sum(normal * bearings[:, 0], axis=1, keepdims=True))
+    axes = np.stack([along, np.cross(normal, along), normal], axis=1)
+    with np.errstate(all="ignore"):  # equal bearings have no plane, and the solver finds no pose
+        axes /= np.linalg.norm(axes, axis=2, keepdims=True)
+        rays = (bearings @ axes.transpose(0, 2, 1)).reshape(-1, 3)
+        rays = rays[:, :2] / rays[:, 2:]
+    mounts = Mounts(axes, seen.mounts.centres[side[::3]], np.zeros((count, 2)))
+    return altered(
+        seen, points=seen.points[chosen], rays=rays, tau=seen.tau[chosen],
+        camera=np.arange(count).repeat(3), mounts=mounts,
+    ), np.arange(3 * count).reshape(count, 3)  # fmt: skip
+
+
 class Hypotheses(NamedTuple):
     """How samples become models, and how models are judged."""
 
@@ -276,11 +319,11 @@ def search(
         rotation: (3,3) that solvers start from.
     """
     observations, solver = observed.observations, hypotheses.solver
-    mounts, data = observations.mounts, observations.packed
-    tau, sides = observations.tau, observations.camera
+    data, tau, sides = observations.packed, observations.tau, views_of(observations, solver)
+    is_wide = sides is not observations.camera
     score, final, noise = hypotheses.score_scale, hypotheses.final_scale, hypotheses.noise
     best, inlier_ratios, drawn = start, None, [0] * len(pools)
-    rotations, shares = mounts.axes @ rotation, [*accumulate(pool.share for pool in pools)]
+    shares = [*accumulate(pool.share for pool in pools)]
     bar = len(observations) * score**2
     left = hypotheses.most if pools else 0
     while left > 0:
@@ -290,12 +333,13 @@ def search(
             draw(pools[k], drawn[k], tau, sides, observed.random, samples[first:last])
             drawn[k] += last - first
         models = np.empty((solver.solutions, MODEL_SIZE, len(samples)))
-        camera = sides[samples[:, 0]]
+        seen, places = _across(observations, samples) if is_wide else (observations, samples)
+        camera = seen.camera[places[:, 0]]
         solver.solve(
-            observations.points, observations.rays, tau, samples, rotations[camera],
+            seen.points, seen.rays, seen.tau, places, (seen.mounts.axes @ rotation)[camera],
             hypotheses.iterations, models,
         )  # fmt: skip
-        states, costs = best_models(models, camera, mounts, data, score, bar)
+        states, costs = best_models(models, camera, seen.mounts, data, score, bar)
         found = Candidate(states[0], costs[0])
         if hypotheses.optimized:
             found = Candidate(*optimize(states, costs, data, 2.0 * score, final, prior, noise))
@@ -380,7 +424,7 @@ class MotionSearch:
         """Find a pose that fits all rows roughly, with a wide threshold."""
         observations = observed.observations
         every, size = np.ones(len(observations), np.bool_), self._start.sample_size
-        pools = pools_of(observations, size, every, observed.ranking, False)
+        pools = pools_of(views_of(observations, self._start), size, every, observed.ranking, False)
         starts = self._starts._replace(most=most)
         return search(observed, starts, held_terms(), pools, np.eye(3), NOTHING)
 
@@ -406,7 +450,7 @@ class MotionSearch:
                     other = self.optimize(observed, towards, self._near, observed.terms)
                     first = min(first, other, key=lambda each: each.cost)
         size = self._solver.sample_size
-        pools = pools_of(observations, size, near, observed.ranking, True)
+        pools = pools_of(observations.camera, size, near, observed.ranking, True)
         motions, turn = self._motions._replace(most=most), rotation_of(start.state)
         return search(observed, motions, observed.terms, pools, turn, first)
 

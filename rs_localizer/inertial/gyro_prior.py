@@ -360,6 +360,8 @@ class GyroscopeTrack:
         """Return in words what it has that the settings hardly allow for; empty: nothing."""
         if self._is_another():
             return self._turns.told()
+        if any(self._contradictions):  # by frames that the numbers did not foresee
+            return ""
         return told_by_numbers(self.errors, self._before_all.diagonal(), self._former)
 
 

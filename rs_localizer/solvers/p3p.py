@@ -132,13 +132,15 @@ def _pose(depths: Vector, bearings: list[Vector], points: list[Vector]) -> tuple
     def frame(corners: list[Vector]) -> list[Vector]:
         one = [a - b for a, b in zip(corners[1], corners[0], strict=True)]
         two = [a - b for a, b in zip(corners[2], corners[0], strict=True)]
-        return [one, two, cross(one, two)]
+        normal = cross(one, two)
+        axes = one, cross(normal, one), normal
+        scales = [1.0 / sqrt(dot(axis, axis)) for axis in axes]
+        return [[v * scale for v in axis] for axis, scale in zip(axes, scales, strict=True)]
 
-    camera, (e1, e2, e3) = frame(seen), frame(points)
-    scale = 1.0 / dot(e3, e3)
-    inverse = [[v * scale for v in row] for row in (cross(e2, e3), cross(e3, e1), e3)]
+    # Depths of near and far points together are rounded; axes are orthonormal nevertheless.
+    camera, own = frame(seen), frame(points)
     rotation = [
-        [dot([axis[i] for axis in camera], [row[j] for row in inverse]) for j in range(3)]
+        [dot([axis[i] for axis in camera], [axis[j] for axis in own]) for j in range(3)]
         for i in range(3)
     ]
     moved = [dot(row, points[0]) for row in rotation]

@@ -52,6 +52,12 @@ def test_a_gyroscope_is_never_worse_than_none(fault, said, alone):
     assert found.said == said
 
 
+@pytest.mark.parametrize("seed", [4, 6])
+def test_nothing_is_named_that_does_not_explain_what_images_deny(seed):
+    recorded = record(Camera(), hand, Wall(), (1, 30), seed, FAULTS["sign of y"])
+    assert followed(recorded).said == ""
+
+
 def test_the_first_image_after_a_gap_is_aided():
     """Half a second after the last one a wall is seen where no track expected it."""
     recorded = record(Camera(), hand, Wall(), (1, 40), 2)
