@@ -119,21 +119,6 @@ def test_what_has_no_bearing_has_none_and_harms_no_neighbour():
     assert np.isnan(camera().project(np.array([[0.0, 0.0, -1.0], [0.1, 0.0, 0.0]]))).all()
 
 
-@pytest.mark.parametrize(
-    ("direction", "expected"),
-    [
-        ("top_to_bottom", [-0.5, -0.5, 0.5, 0.5]),
-        ("bottom_to_top", [0.5, 0.5, -0.5, -0.5]),
-        ("left_to_right", [-0.5, 0.5, -0.5, 0.5]),
-        ("right_to_left", [0.5, -0.5, 0.5, -0.5]),
-    ],
-)
-def test_row_time_runs_from_first_to_last_exposed_pixel(direction, expected):
-    corners = np.array([[0, 0], [639, 0], [0, 479], [639, 479]], float)
-    found = camera(scan_direction=direction).row_time(corners)
-    np.testing.assert_allclose(found, expected, atol=1e-15)
-
-
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_row_time_of_a_crop_is_that_of_the_sensor_row(direction):
     cropped = camera(binning=(2, 2), roi=Roi(100, 60, 400, 300), scan_direction=direction)

@@ -62,12 +62,6 @@ def test_stamps_are_those_of_the_first_delivered_row():
     np.testing.assert_allclose(first, 10.0, atol=1e-12)
 
 
-def test_a_camera_is_where_its_extrinsics_say():
-    mounts = pair().exposure().mounts
-    seen = mounts.axes[1] @ (np.array([0.3, 0.2, 2.0]) - mounts.centres[1])
-    np.testing.assert_allclose(seen, DOWN[0] @ [0.3, 0.2, 2.0] + DOWN[1])
-
-
 def test_stamps_must_be_of_one_frame():
     with pytest.raises(ValueError, match="no camera 'left'"):
         pair().exposure(["left"])

@@ -14,16 +14,9 @@ from scipy.spatial.transform import Rotation
 import rs_localizer as rsl
 from benchmarks.independent.cameras import Camera as TrueCamera
 from benchmarks.independent.cameras import Scan
+from rs_localizer.core import shake
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.rotation_prior import NODES, WHOLE, RotationPrior, compensated, parts_of
-from rs_localizer.core.shake import (
-    CYCLES,
-    FUNCTIONS,
-    MIDDLE_RATES,
-    MIDDLE_VALUES,
-    shake_at,
-    shake_basis,
-)
 from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.core.so3 import hat
 
@@ -94,8 +87,8 @@ TAUS = [-0.5, -0.21, 0.0, 0.37, 0.5]
 
 
 def basis(tau):
-    values, rates = np.empty(FUNCTIONS), np.empty(FUNCTIONS)
-    shake_basis(tau, values, rates)
+    values, rates = np.empty(shake.FUNCTIONS), np.empty(shake.FUNCTIONS)
+    shake.shake_basis(tau, values, rates)
     return values, rates
 
 
@@ -106,23 +99,23 @@ def plain(tau):
 
 
 def test_what_is_taken_away_there_makes_it_whole_waves_again():
-    values, slopes = MIDDLE_VALUES, MIDDLE_RATES
+    values, slopes = shake.MIDDLE_VALUES, shake.MIDDLE_RATES
     for tau in TAUS:
-        angle = 2.0 * np.pi * CYCLES * tau
+        angle = 2.0 * np.pi * shake.CYCLES * tau
         waves = np.column_stack([np.cos(angle), np.sin(angle)]).ravel()
         np.testing.assert_allclose(basis(tau)[0] + values + tau * slopes, waves, atol=1e-12)
 
 
 def test_the_turn_of_many_rows_is_the_sum_of_all_functions():
     rng = np.random.default_rng(0)
-    tau, coefficients = rng.uniform(-0.5, 0.5, 9), rng.normal(size=(FUNCTIONS, 3))
-    found, h = shake_at(tau, coefficients), 1e-5
+    tau, coefficients = rng.uniform(-0.5, 0.5, 9), rng.normal(size=(shake.FUNCTIONS, 3))
+    found, h = shake.shake_at(tau, coefficients), 1e-5
     ahead, here, behind = (
         np.array([plain(t + x) for t in tau]) @ coefficients for x in (h, 0.0, -h)
     )
     np.testing.assert_allclose(found[:, :3], here, atol=1e-11)
     np.testing.assert_allclose(found[:, 3:], (ahead - behind) / (2.0 * h), atol=1e-4)
-    assert not shake_at(tau, np.zeros((0, 3))).any()
+    assert not shake.shake_at(tau, np.zeros((0, 3))).any()
 
 
 TAU = np.linspace(-0.8, 0.8, 33)

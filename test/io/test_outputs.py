@@ -11,19 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core import so3
+from rs_localizer.io import trajectories
 from rs_localizer.io.bags import BagError, BagWriter, make_message, typestore
 from rs_localizer.io.messages import make_header, make_vector
 from rs_localizer.io.outputs import TYPES, BodyPose, Localized, Twist, messages
-from rs_localizer.io.trajectories import (
-    Trajectory,
-    TrajectoryError,
-    format_stamp,
-    parse_stamp,
-    read_motions,
-    read_tum,
-    split_at_gaps,
-    write_tum,
-)
 
 
 @pytest.fixture
@@ -99,11 +90,13 @@ def test_an_unknown_twist_is_not_sent_or_says_so(frame):
 POSE = "0.1 0.2 0.3 0 0 0 1"
 
 
-def trajectory(stamps_ns: list[int]) -> Trajectory:
+def trajectory(stamps_ns: list[int]) -> trajectories.Trajectory:
     rng = np.random.default_rng(1)
     quaternions = rng.normal(size=(len(stamps_ns), 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    return Trajectory(np.array(stamps_ns), rng.normal(size=(len(stamps_ns), 3)), quaternions)
+    return trajectories.Trajectory(
+        np.array(stamps_ns), rng.normal(size=(len(stamps_ns), 3)), quaternions
+    )
 
 
 @pytest.mark.parametrize(
@@ -118,15 +111,15 @@ def trajectory(stamps_ns: list[int]) -> Trajectory:
     ],
 )
 def test_stamps_are_exact(text, stamp_ns):
-    assert parse_stamp(text) == stamp_ns
-    assert parse_stamp(format_stamp(stamp_ns)) == stamp_ns
+    assert trajectories.parse_stamp(text) == stamp_ns
+    assert trajectories.parse_stamp(trajectories.format_stamp(stamp_ns)) == stamp_ns
 
 
 @pytest.mark.parametrize("name", ["poses.txt", "poses.txt.gz"])
 def test_poses_round_trip(tmp_path, name):
     written = trajectory([-5, 0, 1, 1_520_531_467_575_280_001, 1_520_531_467_575_280_002])
-    write_tum(tmp_path / name, written)
-    read = read_tum(tmp_path / name)
+    trajectories.write_tum(tmp_path / name, written)
+    read = trajectories.read_tum(tmp_path / name)
     np.testing.assert_array_equal(read.stamps_ns, written.stamps_ns)
     np.testing.assert_array_equal(read.positions, written.positions)
     np.testing.assert_allclose(read.quaternions, written.quaternions, rtol=0, atol=1e-15)
@@ -145,27 +138,29 @@ def test_poses_round_trip(tmp_path, name):
 )
 def test_faults_are_named(tmp_path, text, expected):
     (tmp_path / "a.txt").write_text(text)
-    with pytest.raises(TrajectoryError, match=expected):
-        read_tum(tmp_path / "a.txt")
+    with pytest.raises(trajectories.TrajectoryError, match=expected):
+        trajectories.read_tum(tmp_path / "a.txt")
 
 
 def test_truths_in_any_order_and_with_gaps(tmp_path):
     lost = "nan NaN nan nan nan nan nan"
     (tmp_path / "a.txt").write_text(f"3 {POSE}\n2 {lost}\n1 {POSE}\n3 {POSE}\n")
-    assert read_tum(tmp_path / "a.txt").stamps_ns.tolist() == [10**9, 3 * 10**9]
+    assert trajectories.read_tum(tmp_path / "a.txt").stamps_ns.tolist() == [10**9, 3 * 10**9]
     (tmp_path / "a.csv").write_text(f"1.5,{POSE.replace(' ', ',')}\n")  # TUM with commas
-    np.testing.assert_array_equal(read_tum(tmp_path / "a.csv").quaternions, [[0, 0, 0, 1]])
+    np.testing.assert_array_equal(
+        trajectories.read_tum(tmp_path / "a.csv").quaternions, [[0, 0, 0, 1]]
+    )
 
 
 def test_split_only_at_gaps():
     # Spacing 10: a pause of 30 is not longer than three spacings, one of 31 is.
-    parts = split_at_gaps(trajectory([0, 10, 20, 50, 60, 70, 101, 111, 121, 500]))
+    parts = trajectories.split_at_gaps(trajectory([0, 10, 20, 50, 60, 70, 101, 111, 121, 500]))
     assert [part.stamps_ns.tolist() for part in parts] == [
         [0, 10, 20, 50, 60, 70],
         [101, 111, 121],
         [500],
     ]
-    assert [len(part) for part in split_at_gaps(trajectory([7]))] == [1]
+    assert [len(part) for part in trajectories.split_at_gaps(trajectory([7]))] == [1]
 
 
 def stamped(kind: str, seconds: int, first: list[float], second: list[float]):
@@ -190,10 +185,10 @@ def test_poses_and_twists_of_a_recording(tmp_path):
             bag.write("/twist", stamped("TwistStamped", seconds, [0, 0, 0.1], position), 0)
         bag.write("/other", stamped("PoseStamped", 9, [0, 0, 0], [0, 0, 0, 1]), 0)
     with pytest.raises(BagError, match=r"several .*PoseStamped: /other, /pose; .* -r pose:=TOPIC"):
-        read_motions(tmp_path / "bag")
+        trajectories.read_motions(tmp_path / "bag")
     with pytest.raises(BagError, match=r"/twist is of type .*Twist.*: /other, /pose"):
-        read_motions(tmp_path / "bag", "/twist")
-    found = read_motions(tmp_path / "bag", "/pose")
+        trajectories.read_motions(tmp_path / "bag", "/twist")
+    found = trajectories.read_motions(tmp_path / "bag", "/pose")
     assert found.poses.stamps_ns.tolist() == [10**9, 2 * 10**9, 3 * 10**9]
     assert found.poses.positions[0].tolist() == [1.0, 2.0, 4.0]
     assert found.poses.quaternions[0].tolist() == [0.0, 0.0, 0.6, 0.8]
@@ -205,12 +200,12 @@ def test_poses_and_twists_of_a_recording(tmp_path):
 def test_poses_of_a_file_and_of_a_recording_of_anything_else(tmp_path):
     file = tmp_path / "poses.txt"
     file.write_text(f"1 {POSE}\n2 {POSE}\n")
-    assert read_motions(file).twists is None
+    assert trajectories.read_motions(file).twists is None
     (tmp_path / "twists.txt").write_text("# nothing\n")
-    found = read_motions(tmp_path)
+    found = trajectories.read_motions(tmp_path)
     assert len(found.poses.stamps_ns) == 2
     assert found.twists is None
     with BagWriter(tmp_path / "bag") as bag:
         bag.write("/twist", stamped("TwistStamped", 1, [0, 0, 0], [0, 0, 0]), 0)
     with pytest.raises(BagError, match=r"no topic of type .*PoseStamped for .*; it has /twist"):
-        read_motions(tmp_path / "bag")
+        trajectories.read_motions(tmp_path / "bag")

@@ -23,15 +23,9 @@ from benchmarks.independent.motions import Motions, States, hand
 from benchmarks.independent.scenes import Rich
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array
+from rs_localizer.io import recording
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.outputs import Localized, messages
-from rs_localizer.io.recording import (
-    CAMERA_FRAME,
-    CAMERA_INFO_TOPIC,
-    CORRESPONDENCES_TOPIC,
-    make_camera_info,
-    make_correspondences,
-)
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.offline.replay import TF_TYPE, find_topics, find_transforms, replay
 from rs_localizer.pipeline.camera_frames import CameraFrames
@@ -100,14 +94,14 @@ def flight(tmp_path_factory) -> Flight:
     with BagWriter(path) as bag:
         start = int(frames.stamp_ns[0])
         mounting = CAMERA_FROM_BASE.inverse()
-        write_tf(bag, start, "/tf_static", ("base_link", CAMERA_FRAME), mounting)
+        write_tf(bag, start, "/tf_static", ("base_link", recording.CAMERA_FRAME), mounting)
         for index in range(LENGTH):
             stamp_ns = int(frames.stamp_ns[index])
             points, pixels = frames.seen(index, NOISE)
-            info = make_camera_info(believed(frames.camera), stamp_ns)
-            cloud = make_correspondences(stamp_ns, points, pixels, np.arange(len(points)))
-            bag.write(CAMERA_INFO_TOPIC, info, stamp_ns)
-            bag.write(CORRESPONDENCES_TOPIC, cloud, stamp_ns)
+            info = recording.make_camera_info(believed(frames.camera), stamp_ns)
+            cloud = recording.make_correspondences(stamp_ns, points, pixels, np.arange(len(points)))
+            bag.write(recording.CAMERA_INFO_TOPIC, info, stamp_ns)
+            bag.write(recording.CORRESPONDENCES_TOPIC, cloud, stamp_ns)
             # Wheels that began elsewhere, and slip by 2 cm a second.
             drift = np.array([1.0, -2.0, 0.5]) + 0.02 * index / 30
             odometry.append(Transform(turned @ truth[1][index], turned @ truth[0][index] + drift))

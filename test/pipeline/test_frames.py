@@ -23,16 +23,12 @@ from rs_localizer.pipeline.camera_frames import CameraFrames
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.pipeline.rig_frames import RigFrames
 from rs_localizer.settings import build, camera_values, write_parameters
+from rs_localizer.tools.simulation import true_motion
 from rs_localizer.tools.simulation.scene import room
 from rs_localizer.tools.simulation.simulated_frames import (
     FrameSettings,
     SimulatedFrame,
     simulate_frames,
-)
-from rs_localizer.tools.simulation.true_motion import (
-    ConstantVelocity,
-    RecordedMotion,
-    sampled_states,
 )
 
 from .clouds import cloud_of
@@ -40,8 +36,8 @@ from .clouds import cloud_of
 READOUT_TIME = 0.03
 K = np.array([[500.0, 0.0, 319.5], [0.0, 510.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(640, 480, K, readout_time=READOUT_TIME)
-FAST = ConstantVelocity(np.array([1.0, -2.0, 3.0]), np.array([1.0, 0.5, -1.5]), 0.3)
-STILL = ConstantVelocity(np.zeros(3), np.zeros(3), 0.1)
+FAST = true_motion.ConstantVelocity(np.array([1.0, -2.0, 3.0]), np.array([1.0, 0.5, -1.5]), 0.3)
+STILL = true_motion.ConstantVelocity(np.zeros(3), np.zeros(3), 0.1)
 
 
 def localized(result: Localized | Refusal | None) -> Localized:
@@ -56,7 +52,7 @@ def refused(result: Localized | Refusal | None) -> tuple[str, str]:
 
 
 def simulated(
-    direction: str = "top_to_bottom", motion: ConstantVelocity = FAST
+    direction: str = "top_to_bottom", motion: true_motion.ConstantVelocity = FAST
 ) -> list[SimulatedFrame]:
     camera = replace(CAMERA, scan_direction=direction)
     world = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
@@ -147,8 +143,8 @@ def test_a_lens_that_is_off_is_noticed_after_half_a_second(begin, bend, told):
 def test_the_unit_of_a_map_is_named_before_its_lens(begin, unit, told):
     """By a hand: priors hold tracked poses back, and what that leaves looks like a wrong lens."""
     frames, notices = begin()
-    motion = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
-    world = room(sampled_states(motion).positions, np.random.default_rng(0), count=3000)
+    motion = true_motion.RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
+    world = room(true_motion.sampled_states(motion).positions, np.random.default_rng(0), count=3000)
     stamps = [motion.intervals_ns[0][0] + round(5e9 + k * 1e9 / 30) for k in range(40)]
     seen = FrameSettings(points=80, noise=0.5, outliers=0.0)
     for frame in simulate_frames(CAMERA, motion, world, seen, stamps_ns=stamps):

@@ -178,15 +178,3 @@ def test_stamps_out_of_order():
     assert (heard.forget.call_count, heard.notices[1:]) == (2, ["map_changed"])
     heard.stream.reset()
     assert heard.reason(4.7, "other") is None
-
-
-def test_a_stamp_of_zero_is_none_and_ends_no_track():
-    heard = Heard()
-    assert [heard.reason(s) for s in (5.0, 0.0, 5.1, 0.0, 5.1)] == [
-        None, "no_stamp", None, "no_stamp", "repeated_stamp",
-    ]  # fmt: skip
-    assert (heard.forget.call_count, heard.notices) == (0, [])
-    # Of a recording that starts at 0 it is a time like any other.
-    heard = Heard()
-    heard.stream.zero_is_time = True
-    assert [heard.reason(s) for s in (0.0, 0.0, 0.1)] == [None, "repeated_stamp", None]

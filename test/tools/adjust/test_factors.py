@@ -13,26 +13,10 @@ from projector import make_camera
 from test_fit import READOUT
 
 from rs_localizer.core import so3
-from rs_localizer.tools.adjust.factors import (
-    Floating,
-    Gyroscope,
-    acceleration_rows,
-    block_rows,
-    rest_rows,
-)
+from rs_localizer.tools.adjust import factors, variables
 from rs_localizer.tools.adjust.problem import Problem
 from rs_localizer.tools.adjust.spline import Layout, Spline
 from rs_localizer.tools.adjust.system import Factored, Quadratic, System
-from rs_localizer.tools.adjust.variables import (
-    CameraView,
-    Extrinsics,
-    Freedom,
-    GyroMount,
-    GyroSamples,
-    SplineKeypoints,
-    Unknowns,
-    start_state,
-)
 
 H = 1e-6
 
@@ -91,20 +75,22 @@ def test_jacobians_are_finite_differences(turn):
             np.testing.assert_allclose(numeric[m], expected, atol=2e-6, rtol=1e-6)
 
 
-MOUNTED = Extrinsics(so3.exp(np.array([0.1, 0.2, -0.1])), np.array([0.05, -0.02, 0.1]), 2e-3)
+MOUNTED = variables.Extrinsics(
+    so3.exp(np.array([0.1, 0.2, -0.1])), np.array([0.05, -0.02, 0.1]), 2e-3
+)
 FREEDOMS = {
-    "board": Freedom(lens=True, landmarks=0.01, stamps=1e-3),
-    "paper": Freedom(lens=True, landmarks=0.01, paper=True),
-    "faded": Freedom(lens=True, fading=0.1),
-    "mounted": Freedom(lens=True, mount=True),
-    "bodies": Freedom(readout_time=False),
+    "board": variables.Freedom(lens=True, landmarks=0.01, stamps=1e-3),
+    "paper": variables.Freedom(lens=True, landmarks=0.01, paper=True),
+    "faded": variables.Freedom(lens=True, fading=0.1),
+    "mounted": variables.Freedom(lens=True, mount=True),
+    "bodies": variables.Freedom(readout_time=False),
 }
 
 
 def small(
     of: str = "board", direction: str = "top_to_bottom", distortion: str = "plumb_bob",
     controls: float = 0.4,
-) -> tuple[Problem, Unknowns]:  # fmt: skip
+) -> tuple[Problem, variables.Unknowns]:  # fmt: skip
     rng, camera = np.random.default_rng(0), make_camera(scan_direction=direction)
     if distortion == "equidistant":
         camera = replace(camera, D=np.array([0.01, -0.02, 0.003, 0.001]),
@@ -114,16 +100,16 @@ def small(
     spline = Spline(layout, *motion.poses(layout.control_times()))
     count = 60
     pixels, frames = rng.uniform(0.0, 400.0, (count, 2)), np.sort(rng.integers(0, 5, count))
-    seen = SplineKeypoints(
+    seen = variables.SplineKeypoints(
         camera, 0.05 + 0.07 * frames, camera.row_time(pixels), pixels,
         landmarks=landmarks, points=rng.integers(0, 8, count), frames=frames,
         trusted=np.ones(count, bool),
         bodies=np.repeat([-1, 0], 4) if of == "bodies" else None,
     )  # fmt: skip
-    state = start_state(seen, spline, READOUT)
+    state = variables.start_state(seen, spline, READOUT)
     extrinsics = MOUNTED if FREEDOMS[of].mount else state.extrinsics
     state = replace(state, delays=rng.normal(0.0, 1e-3, 5), extrinsics=extrinsics)
-    return fitting(Problem([CameraView(seen, FREEDOMS[of])], state), state), state
+    return fitting(Problem([variables.CameraView(seen, FREEDOMS[of])], state), state), state
 
 
 @pytest.mark.parametrize("of", list(FREEDOMS))
@@ -135,18 +121,18 @@ def test_keypoints(of, direction, distortion):
     are_derivatives(lambda one: problem.keypoint_rows(one, 100.0)[0], problem, state)
 
 
-ACCELERATIONS = Freedom(angular_acceleration=3.0, linear_acceleration=2.0)
+ACCELERATIONS = variables.Freedom(angular_acceleration=3.0, linear_acceleration=2.0)
 FADING = replace(ACCELERATIONS, fading=0.1)
 
 
 @pytest.mark.parametrize(
     ("rows", "controls"),
     [
-        (lambda problem, start, one: acceleration_rows(one.spline, ACCELERATIONS), 0.4),
-        (lambda problem, start, one: acceleration_rows(one.spline, FADING), 0.4),
-        (lambda problem, start, one: rest_rows(one.spline, 2.0, 1.0), 0.04),  # images alone
-        (lambda problem, start, one: Floating(start.spline).rows(one.spline), 0.4),
-        (lambda problem, start, one: block_rows(
+        (lambda problem, start, one: factors.acceleration_rows(one.spline, ACCELERATIONS), 0.4),
+        (lambda problem, start, one: factors.acceleration_rows(one.spline, FADING), 0.4),
+        (lambda problem, start, one: factors.rest_rows(one.spline, 2.0, 1.0), 0.04),  # images alone
+        (lambda problem, start, one: factors.Floating(start.spline).rows(one.spline), 0.4),
+        (lambda problem, start, one: factors.block_rows(
             one.delays[:, None], np.full(5, 0.5), problem.at[0]["delays"].start), 0.4),
     ],
     ids=["accelerations", "fading", "rest", "the whole", "blocks"],
@@ -158,13 +144,15 @@ def test_what_is_expected_of_the_motion(rows, controls):
 
 def test_a_gyroscope():
     problem, state = small()
-    mount = GyroMount(MOUNTED.axes, np.array([0.02, -0.01, 0.03]), 0.003, np.full(6, 0.02))
-    samples = GyroSamples(np.linspace(0.05, 0.3, 7), np.zeros((7, 3)), 1e4)
+    mount = variables.GyroMount(
+        MOUNTED.axes, np.array([0.02, -0.01, 0.03]), 0.003, np.full(6, 0.02)
+    )
+    samples = variables.GyroSamples(np.linspace(0.05, 0.3, 7), np.zeros((7, 3)), 1e4)
     seen = replace(problem.views[0].observations, gyro=samples)
     state = replace(state, mount=mount)
     problem = Problem([replace(problem.views[0], observations=seen)], state)
     # So that Tukey's weights are one.
-    gyro = Gyroscope(samples, state)
+    gyro = factors.Gyroscope(samples, state)
     are_derivatives(lambda one: gyro.terms(one, problem.at[0]["gyro"].start)[0], problem, state)
 
 
@@ -178,7 +166,7 @@ def test_what_is_known_beforehand(of, count):
     step[: problem.groups.motion] = 0.0
     off = problem.moved(state, np.r_[step, np.zeros(problem.groups.blocks)])
 
-    def priors(one: Unknowns) -> list[Quadratic]:
+    def priors(one: variables.Unknowns) -> list[Quadratic]:
         return [term for term in problem.terms(one, 100.0) if isinstance(term, Quadratic)]
 
     known = priors(off)

@@ -18,40 +18,22 @@ from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.rigs import RigParts, mounted_lenses, node_parameters
 from rs_localizer.io.trajectories import Trajectory, read_tum
 from rs_localizer.settings import write_parameters
+from rs_localizer.tools.simulation import simulated_frames, simulated_imu, true_motion
 from rs_localizer.tools.simulation.scene import room
-from rs_localizer.tools.simulation.simulated_frames import (
-    FrameSettings,
-    SimulatedFrame,
-    frame_stamps,
-    simulate_frames,
-)
-from rs_localizer.tools.simulation.simulated_imu import (
-    ImuSettings,
-    Lever,
-    Shaken,
-    shaken,
-    simulate_imu,
-)
 from rs_localizer.tools.simulation.simulated_recording import MountedMotion
-from rs_localizer.tools.simulation.true_motion import (
-    BODY_FROM_CAMERA,
-    ConstantVelocity,
-    RecordedMotion,
-    TrueMotion,
-)
 
 K = np.array([[400.0, 0.0, 319.5], [0.0, 410.0, 239.5], [0.0, 0.0, 1.0]])
-MOTION = ConstantVelocity(np.array([0.6, -2.0, 1.5]), np.array([1.0, 0.5, 0.25]), 1.0)
+MOTION = true_motion.ConstantVelocity(np.array([0.6, -2.0, 1.5]), np.array([1.0, 0.5, 0.25]), 1.0)
 MAP = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
-CLEAN = FrameSettings(points=100, noise=0.0, outliers=0.0)
+CLEAN = simulated_frames.FrameSettings(points=100, noise=0.0, outliers=0.0)
 
 
 def camera(direction: str = "top_to_bottom") -> Camera:
     return Camera(640, 480, K, readout_time=0.03, scan_direction=direction)
 
 
-def frames(direction: str = "top_to_bottom") -> list[SimulatedFrame]:
-    return list(simulate_frames(camera(direction), MOTION, MAP, CLEAN))
+def frames(direction: str = "top_to_bottom") -> list[simulated_frames.SimulatedFrame]:
+    return list(simulated_frames.simulate_frames(camera(direction), MOTION, MAP, CLEAN))
 
 
 @pytest.mark.parametrize("direction", list(ScanDirection))
@@ -78,8 +60,8 @@ def test_points_that_a_lens_folds_back_are_not_seen():
     # Strong barrel distortion: beyond 60 degrees off axis the polynomial runs backwards.
     wide = [[200.0, 0.0, 319.5], [0.0, 205.0, 239.5], [0.0, 0.0, 1.0]]
     lens = Camera(640, 480, wide, [-0.35, 0.0, 0.0, 0.0])
-    every = FrameSettings(points=5000, noise=0.0, outliers=0.0)
-    for frame in list(simulate_frames(lens, MOTION, MAP, every))[::10]:
+    every = simulated_frames.FrameSettings(points=5000, noise=0.0, outliers=0.0)
+    for frame in list(simulated_frames.simulate_frames(lens, MOTION, MAP, every))[::10]:
         x, y, z = frame.motion.rotation @ frame.points.T + frame.motion.translation[:, None]
         np.testing.assert_allclose(lens.rays(frame.pixels), np.c_[x / z, y / z], atol=1e-3)
 
@@ -89,7 +71,7 @@ def test_a_wide_lens_shows_what_lies_behind_it():
     wide = [[160.0, 0.0, 319.5], [0.0, 164.0, 239.5], [0.0, 0.0, 1.0]]
     lens = Camera(640, 480, wide, [0.63, 1.05], "eucm")
     behind = 0
-    for frame in list(simulate_frames(lens, MOTION, MAP, CLEAN))[::10]:
+    for frame in list(simulated_frames.simulate_frames(lens, MOTION, MAP, CLEAN))[::10]:
         x, y, z = frame.motion.rotation @ frame.points.T + frame.motion.translation[:, None]
         scale = 0.63 * np.sqrt(1.05 * (x**2 + y**2) + z**2) + 0.37 * z
         np.testing.assert_allclose(frame.pixels[:, 0], 160 * x / scale + 319.5, atol=1e-6)
@@ -103,8 +85,8 @@ def test_no_frame_touches_a_gap():
     t = t[((t < 1.0) | (t > 1.4)) & ((t < 2.0) | (t > 2.05))]
     stamps_ns = 1_500_000_000_000_000_000 + np.round(t * 1e9).astype(np.int64)
     quaternions = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
-    motion = RecordedMotion(Trajectory(stamps_ns, np.zeros((len(t), 3)), quaternions))
-    stamps = np.array(frame_stamps(motion, camera(), 30.0))
+    motion = true_motion.RecordedMotion(Trajectory(stamps_ns, np.zeros((len(t), 3)), quaternions))
+    stamps = np.array(simulated_frames.frame_stamps(motion, camera(), 30.0))
     for stamp in stamps:
         inside = [first <= stamp <= last - 30_000_000 for first, last in motion.intervals_ns]
         assert sum(inside) == 1
@@ -131,23 +113,23 @@ def recording(t: Array) -> Trajectory:
     return Trajectory(START_NS + np.round(t * 1e9).astype(np.int64), positions, quaternions)
 
 
-STEADY = ConstantVelocity(
+STEADY = true_motion.ConstantVelocity(
     np.array([0.5, -1.5, 2.0]), np.array([1.0, -0.5, 0.25]), 4.0, start_ns=START_NS
 )
 TURN = Rotation.from_euler("xyz", [0.1, -0.2, np.pi]).as_matrix()
 PLACE = np.array([0.1, -0.2, 0.05])
 MOTIONS = {
     "constant": STEADY,
-    "shaken": shaken(STEADY, [(0.3, 60.0), (0.1, 120.0)], np.random.default_rng(2)),
+    "shaken": simulated_imu.shaken(STEADY, [(0.3, 60.0), (0.1, 120.0)], np.random.default_rng(2)),
     "mounted": MountedMotion(STEADY, TURN, PLACE),
-    "smoothed": RecordedMotion(recording(np.arange(0.0, 4.0, 1 / 120))),
-    "interpolated": RecordedMotion(recording(np.arange(0.0, 4.0, 1 / 39))),
+    "smoothed": true_motion.RecordedMotion(recording(np.arange(0.0, 4.0, 1 / 120))),
+    "interpolated": true_motion.RecordedMotion(recording(np.arange(0.0, 4.0, 1 / 39))),
 }
 
 
 @pytest.mark.parametrize("name", MOTIONS)
 def test_velocities_are_the_derivatives_of_the_poses(name):
-    motion: TrueMotion = MOTIONS[name]
+    motion: true_motion.TrueMotion = MOTIONS[name]
     step = 1e-5
     for seconds in (0.5, 1.7, 3.1):
         stamp_ns = START_NS + round(seconds * 1e9)
@@ -165,7 +147,7 @@ def test_spline_follows_the_recording(name, tolerance):
     t = np.linspace(0.1, 3.9, 401)
     state = MOTIONS[name].state(START_NS, t)
     positions, rotations = recorded_way(t)
-    expected = rotations.as_matrix() @ BODY_FROM_CAMERA
+    expected = rotations.as_matrix() @ true_motion.BODY_FROM_CAMERA
     np.testing.assert_allclose(state.positions, positions, atol=tolerance)
     np.testing.assert_allclose(state.rotations, expected, atol=tolerance)
 
@@ -236,18 +218,18 @@ def test_pixels_are_those_of_the_row_by_the_cameras_own_clock(rig_recording):
     assert np.ptp(apart) > 1e3
 
 
-PERFECT = ImuSettings(2000.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+PERFECT = simulated_imu.ImuSettings(2000.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 CAMERA_FROM_IMU = Rotation.from_euler("xyz", [20.0, -70.0, 140.0], degrees=True).as_matrix()
-LEVER = Lever(CAMERA_FROM_IMU, np.array([0.1, -0.05, 0.02]))
+LEVER = simulated_imu.Lever(CAMERA_FROM_IMU, np.array([0.1, -0.05, 0.02]))
 RNG = np.random.default_rng(0)
 
 
 def test_the_motion_comes_back_when_it_is_integrated():
     """Dead reckoning by the midpoint rule, over a second of a hand that shakes."""
-    hand = RecordedMotion(read_tum(data.path(data.HAND_MOTION)).part(slice(0, 300)))
-    motion = Shaken(hand, math.radians(0.3), 60.0, np.array([0.6, 0.0, 0.8]), 1.0)
+    hand = true_motion.RecordedMotion(read_tum(data.path(data.HAND_MOTION)).part(slice(0, 300)))
+    motion = simulated_imu.Shaken(hand, math.radians(0.3), 60.0, np.array([0.6, 0.0, 0.8]), 1.0)
     first = hand.intervals_ns[0][0]
-    track = simulate_imu(motion, PERFECT, LEVER, RNG)
+    track = simulated_imu.simulate_imu(motion, PERFECT, LEVER, RNG)
     count = 2001
     start = motion.state(first, np.zeros(1))
     map_from_imu = Rotation.from_matrix(start.rotations[0] @ CAMERA_FROM_IMU)
