@@ -34,14 +34,17 @@ others are below 1e-4 of the largest, and they rotate the middle row as little."
 def _resolved() -> tuple[Array, Array]:
     """Return combinations (28,18) of the functions, and the functions as their sums (18,28).
 
-    The combinations of an ordinary vibration are independent, and of size 1.
+    The combinations of an ordinary vibration are independent, and of size 1. They turn the last row
+    forward: without that, each version of LAPACK has other signs, and kernels that were built with
+    another one would not fit.
     """
     tau, sizes = np.linspace(-0.5, 0.5, 401)[:, None], np.repeat(TYPICAL_SIZES, 2)
     shown = np.empty((len(tau), FUNCTIONS))
     shown[:, ::2] = np.cos(RATES * tau) * sizes[::2]
     shown[:, 1::2] = np.sin(RATES * tau) * sizes[1::2]
     _, _, parts = np.linalg.svd(shown, full_matrices=False)
-    return np.ascontiguousarray(sizes[:, None] * parts[:RESOLVED].T), parts[:RESOLVED] / sizes
+    parts = parts[:RESOLVED] * np.sign(parts[:RESOLVED] @ shown[-1])[:, None]
+    return np.ascontiguousarray(sizes[:, None] * parts.T), parts / sizes
 
 
 COMBINATIONS, IN_COMBINATIONS = _resolved()
