@@ -7,17 +7,18 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+from rosbags.rosbag2 import StoragePlugin
 
 import rs_localizer.localizer
 import rs_localizer.tracking
 from rs_localizer.core import so3
-from rs_localizer.io.bags import STORAGES, BagWriter, make_message, open_bag
+from rs_localizer.io.bags import BagWriter, make_message, open_bag
 
 
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
-        for storage in STORAGES:
-            path = Path(folder) / storage
+        for storage in StoragePlugin:
+            path = Path(folder) / storage.name
             with BagWriter(path, storage) as bag:
                 bag.write("/a", make_message("std_msgs/msg/String", data="b"), 1)
             (lone,) = (file for file in path.iterdir() if file.suffix != ".yaml")
