@@ -52,7 +52,7 @@ _MOTION = tuple(name for name in TYPES if name != topics.INLIERS)
 _ODD = (
     "map_is_camera", "coarse_coordinates", "pixels_outside", "camera_changed", "no_images",
     "lens", "extrinsics", "bad_imu", "map_scale", "map_jumped", "two_publishers", "doubtful",
-    "would_fit", "second_broadcaster", "stale_landmarks",
+    "would_fit", "second_broadcaster", "stale_landmarks", "bad_camera_info", "bad_map",
 )  # fmt: skip
 
 
@@ -317,6 +317,10 @@ class LocalizerNode(ManagedNode[NodeConfig, Localized]):
         if frames is not None:
             said, odd = frames.describe()
             values, oddities = values | said, oddities | odd
+        pose = self.resolve_topic_name(f"~/{topics.POSE}")
+        if (count := self.count_publishers(pose)) > 1:
+            text = f"{count} nodes publish {pose}: was this one started twice?"
+            oddities = oddities | {Notice.TWO_PUBLISHERS: text}
         inputs = {
             name: item for name, item in self.silence.items() if name in inputs_of(self.config)
         }

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import PoseStamped
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import SetParametersAtomically
@@ -76,6 +77,21 @@ def test_node_and_replay_say_the_same_to_the_last_byte(recording, tmp_path, star
     assert peer.spin_until(lambda: twists_of_one_more() == 0)
     assert robot.set("readout_time", READOUT_TIME) == (True, "")
     assert peer.spin_until(lambda: twists_of_one_more() > 0)
+    assert node.stop() == 0
+
+
+def test_a_lens_that_cannot_be_used_and_a_second_node_are_said(recording, start_node, peer):
+    """Poses go on with the last lens, and each frame would have two poses."""
+    node, robot = start_node(*SHUTTER), Robot(peer)
+    robot.connect()
+    for k, (info, cloud) in enumerate(inputs(recording)[:4]):
+        info.k = info.k if k < 2 else np.zeros(9)
+        robot.localize(info, cloud)
+    assert peer.spin_until(lambda: "Notice: bad_camera_info" in robot.odd)
+    assert "Notice: two_publishers" not in robot.odd
+    peer.node.create_publisher(PoseStamped, "/rs_localizer/pose", 1)
+    assert peer.spin_until(lambda: "Notice: two_publishers" in robot.odd)
+    assert len(robot.answers["pose"]) == 4
     assert node.stop() == 0
 
 
