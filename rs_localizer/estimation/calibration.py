@@ -43,10 +43,10 @@ _ERRORS = 5
 _NO_PART = 0.02
 _CONFIGURED = np.array([speed == 1.0 for speed in SPEEDS], float)
 # fy over fx changes as each changes by a half, the other way.
-_ASPECT = np.array([-0.5, 0.5])
+ASPECT = np.array([-0.5, 0.5])
 
 # More points than this only take time: sums over all of them are as well known.
-_MANY = 250
+MANY = 250
 # Points this near (m) to a landmark are that landmark, in single precision as far as 8 km.
 _SAME = 0.001
 # A direction to sort landmarks by: no wall, floor or row of them is across it.
@@ -120,8 +120,8 @@ def calibration_effect(
     """
     observations, chosen = observed.observations, np.flatnonzero(posterior.inliers)
     exposure, found = observed.exposure, len(chosen)
-    if found > _MANY:
-        chosen = chosen[np.linspace(0, found - 1, _MANY).astype(np.int64)]
+    if found > MANY:
+        chosen = chosen[np.linspace(0, found - 1, MANY).astype(np.int64)]
     some = observations.only(chosen)
     state, tau = posterior.state, some.tau
     lines = linearized(some.packed, len(some), state, shake_at(tau, posterior.shake))
@@ -252,7 +252,7 @@ def _columns(camera: Camera, towards: Array, deviation: CalibrationErrors) -> Ar
     columns[:, :, 2] = deviation.focal_length * by_all[:, :, focal : focal + 2].sum(axis=2)
     columns[:, :, 3] = deviation.distortion / corner_pixels * by_all[:, :, 0]
     by_each = np.diagonal(by_all[:, :, focal : focal + 2], axis1=1, axis2=2)
-    columns[:, :, 4] = deviation.aspect_ratio * by_each * _ASPECT
+    columns[:, :, 4] = deviation.aspect_ratio * by_each * ASPECT
     return columns
 
 
@@ -268,7 +268,7 @@ def _by_pinhole(rays: Array2, focal: Array1, lens: Array1, sizes: Array1) -> Arr
             columns[i, axis, axis] = sizes[0]
             columns[i, axis, 2] = sizes[1] * pixels[i, axis]
             columns[i, axis, 3] = sizes[2] * focal[axis] * rays[i, axis] * slope
-            columns[i, axis, 4] = sizes[3] * pixels[i, axis] * _ASPECT[axis]
+            columns[i, axis, 4] = sizes[3] * pixels[i, axis] * ASPECT[axis]
     return columns
 
 

@@ -42,7 +42,7 @@ from rs_localizer.core.state import (
     VELOCITIES,
 )
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.calibration import LandmarkErrors
+from rs_localizer.estimation.calibration import ASPECT, LandmarkErrors
 from rs_localizer.estimation.linear_fit import known_at
 from rs_localizer.estimation.points import FrameSights, find_usable, pack, packed
 from rs_localizer.estimation.prior import PriorTerms, state_in
@@ -118,8 +118,6 @@ _BEYOND_USUAL = 5.0
 _REMEDY = "are mounts, stamps and K those of these cameras (rs_localizer calibrate --rig)?"
 # Of what frames tell, the part that the next one knows: mounts are bumped.
 _KEPT_OF_CAMERAS = 0.97
-# fy over fx changes as each changes by a half, the other way.
-_ASPECT = np.array([-0.5, 0.5])
 
 
 class Fitted(NamedTuple):
@@ -348,7 +346,7 @@ def _lines_of(
     by_stamp = -(by_way @ shifts @ speeds)
     state = np.concatenate((rotation.ravel(), -(rotation @ place), speeds.ravel()))
     state[STATE_ANGULAR.start : STATE_LINEAR.stop] += _CUBIC[k] * own[_BESIDE]
-    scale, shift = np.exp(numbers[_LENGTH] + numbers[_RATIO] * _ASPECT), (length - 1.0) * lens[:2]
+    scale, shift = np.exp(numbers[_LENGTH] + numbers[_RATIO] * ASPECT), (length - 1.0) * lens[:2]
     by_ray = frame.by_ray * scale
     data = pack(
         frame.points, (frame.rays - shift) / scale, frame.tau, by_ray, frame.camera, frame.mounts
@@ -374,7 +372,7 @@ def _lines_of(
             down = by_ray[i, side, 1] * lines.image[i, 1]
             moved = length * (given[0] * lens[0] + given[1] * lens[1])
             shared[_LENGTH] = across + down + moved
-            shared[_RATIO] = across * _ASPECT[0] + down * _ASPECT[1]
+            shared[_RATIO] = across * ASPECT[0] + down * ASPECT[1]
             shared[_LENS.start + side] = 1.0
             shared[_LENS.stop - 1] = radial * (given[0] * x + given[1] * y)
             for k in range(_SHARED - _MAP.start):
@@ -544,7 +542,7 @@ class FramesTogether:
         """Return the camera with these numbers beside K's, as in ``doubt``."""
         (camera,) = self._exposure.cameras
         K = camera.K.copy()
-        K[[0, 1], [0, 1]] *= np.exp(length + aspect * _ASPECT)
+        K[[0, 1], [0, 1]] *= np.exp(length + aspect * ASPECT)
         K[:2, 2] += math.expm1(length) * self._principal * camera.focal_length + centre
         return replace(camera, K=K)
 

@@ -41,7 +41,7 @@ from rs_localizer.estimation.linear_fit import (
     taken_by,
 )
 from rs_localizer.estimation.points import leaning_less, plane_of
-from rs_localizer.estimation.prior import PriorTerms, offset_between, terms_at
+from rs_localizer.estimation.prior import ROUNDING, PriorTerms, offset_between, terms_at
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.robust import TINY, apply_step
 from rs_localizer.native import entry, inlined, kernel
@@ -66,8 +66,6 @@ _ALIKE, _NO_PART = 0.15, 0.05
 _LEAST_PART, _MOST_PARTS = 4.0, 100
 # If the evidence falls faster than the mode's Gaussian, steps shrink at least to this.
 _LEAST_SHARE = 0.25
-# Rotations are orthonormal to this, also where thousands of steps have rounded them.
-_ROUNDED = 1e-6
 # Part of the squared errors that is left at least: of a camera that shakes, noise is a tenth.
 _MOST_BETTER = 0.01
 
@@ -143,7 +141,7 @@ def is_motion(state: Array1, covariance: Array2) -> bool:
     """Return whether both are finite, and the rotation is one: points on a line let it run away."""
     turn = state[:9].copy().reshape(3, 3)
     off = np.max(np.abs(turn @ turn.T - np.eye(3)))
-    return bool(np.all(np.isfinite(state)) and np.all(np.isfinite(covariance)) and off < _ROUNDED)
+    return bool(np.all(np.isfinite(state)) and np.all(np.isfinite(covariance)) and off < ROUNDING)
 
 
 @entry

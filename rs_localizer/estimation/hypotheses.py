@@ -80,8 +80,6 @@ _FAR_LESS_PROBABLE = 9.0
 _CLEARLY_MOVING, _LITTLE_OF_THE_PRIOR = 67.0, 0.05
 # A fit that loses more inliers than this part leaves is another group of points.
 _KEPT = 0.9
-# Probability that does not count, of either kind of camera.
-_NO_PART = 1e-4
 # Log odds of no vibration: one in ten of the cameras that do not show vibration has some.
 _HIDDEN_ODDS = math.log(10.0)
 # Logarithm of the evidence of any vibration against none from which it is fitted; before a plane,
@@ -401,15 +399,8 @@ def _vibrating(
 
 def _mixed(given: _Given, groups: list[_Camera]) -> Posterior:
     """Mix all hypotheses; the inliers are those of the most probable kind."""
-    if len(groups) > 1:
-        first, evidences, preferences = len(groups[0].preferences), *_of_all(groups)
-        shares = [
-            weights_of(each)[:first].sum() for each in (TEMPER * evidences, evidences + preferences)
-        ]
-        keeps = max(shares) > _NO_PART, 1.0 - min(shares) > _NO_PART
-        groups = [one for one, keep in zip(groups, keeps, strict=True) if keep]
     parts = groups[0].parts if len(groups) == 1 else _together(*(one.parts for one in groups))
-    found = mixture(parts, _of_all(groups)[1], TEMPER)
+    found = mixture(parts, np.concatenate([one.preferences for one in groups]), TEMPER)
     rather = len(groups) > 1 and found.probable[: len(groups[0].preferences)].sum() < 0.5
     likely = groups[1 if rather else 0].posterior
     covariance, shake = found.covariance, np.zeros((0, 3))
@@ -419,14 +410,6 @@ def _mixed(given: _Given, groups: list[_Camera]) -> Posterior:
     if not len(likely.squared_errors):  # of all steady ones, and not of the best one alone
         likely = likely._replace(squared_errors=given.observations.squared_errors(found.state))
     return likely._replace(state=found.state, covariance=covariance, shake=shake)
-
-
-def _of_all(groups: list[_Camera]) -> tuple[Array, Array]:
-    """Return evidences and preferences of all hypotheses."""
-    return (
-        np.concatenate([one.parts.evidences for one in groups]),
-        np.concatenate([one.preferences for one in groups]),
-    )
 
 
 def _together(steady: Gaussians, vibrating: Gaussians) -> Gaussians:

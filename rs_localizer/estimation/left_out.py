@@ -28,9 +28,10 @@ from rs_localizer.core.state import (
 )
 from rs_localizer.core.types import Failure, altered
 from rs_localizer.estimation.acceptance import speeding
-from rs_localizer.estimation.calibration import promised
+from rs_localizer.estimation.calibration import MANY, promised
 from rs_localizer.estimation.hypotheses import Posterior
 from rs_localizer.estimation.linear_fit import known_at
+from rs_localizer.estimation.moved_part import LEAST_CHANCE
 from rs_localizer.estimation.points import Observations, Observed
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.robust import (
@@ -46,14 +47,9 @@ from rs_localizer.estimation.search import GLOBAL_SHUTTER_SCALE, MotionSearch
 # So many points have a motion, or a pose, whatever they are; the corners of one marker may be
 # misplaced in the map.
 SAMPLE, _OF_POSE, _MARKER = 6, 3, 4
-# Explanations that chance makes in one frame of 1,000 (Desolneux, Moisan and Morel, IJCV 2000: the
-# number of false alarms).
-_LEAST_CHANCE = -math.log(1e-3)
 # Odds for a motion to be the world's, of two motions, from which it is published. Second bodies of
 # 40 to 45 % of 100 points leave 4.8 to 60, halves of a map that were moved mostly 1 (paired set).
 _LEAST_ODDS = 4.0
-# More points than this only take time.
-_MANY = 250
 # Beyond so many gates a point is another's.
 _ELSEWHERE = 2.0
 # Gates before a declared map, of two motions, differ by less, and a widened one from both by more.
@@ -169,7 +165,7 @@ def left_out(
         moment = np.outer(step, step) + second.covariance
         other = size / (found + size) * moment[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
         text = f"{text}: have these points been moved, or do they move?"
-        surely = math.log(odds) > _LEAST_CHANCE
+        surely = math.log(odds) > LEAST_CHANCE
         return LeftOut(None, text, other, second.chosen, surely)
     return LeftOut(Failure(
         Reason.MODEL_ERROR,
@@ -260,16 +256,16 @@ def _own_motion(
     """Return the motion that more left-out points share than chance makes, or None."""
     observations, gate = observed.observations, WIDEST_GATE * threshold
     left, area = int(np.count_nonzero(rest)), _area(observed)
-    some = np.flatnonzero(rest)[:: 1 + left // _MANY].copy()
+    some = np.flatnonzero(rest)[:: 1 + left // MANY].copy()
     part = altered(observed, observations=observations.only(some), ranking=observed.ranking[:0])
     start, circle = search.rough(part), GLOBAL_SHUTTER_SCALE * observed.assumed.focal_length
     near = int(np.count_nonzero(part.observations.within(start.state, circle)))
-    if _surprise(len(some), near, _OF_POSE, math.pi * circle**2 / area) < _LEAST_CHANCE:
+    if _surprise(len(some), near, _OF_POSE, math.pi * circle**2 / area) < LEAST_CHANCE:
         return None
     own = search.from_rough(part, start)
     group = rest & observations.within(own.state, gate)
     size = int(np.count_nonzero(group))
-    if _surprise(left, size, SAMPLE, math.pi * gate**2 / area) < _LEAST_CHANCE:
+    if _surprise(left, size, SAMPLE, math.pi * gate**2 / area) < LEAST_CHANCE:
         return None
     chosen = observations.only(np.flatnonzero(group))
     best = best_motion(chosen.packed, len(chosen), own.state, observed.terms, threshold)
@@ -305,8 +301,8 @@ def _of_another_lens(
     first = _Group(posterior.inliers, posterior.state, posterior.squared_errors)
     parts = [(first,)] if second is None else [(first,), (first, second)]
     evidence = max(_evidence(groups, PARAMETERS * len(groups), count, area) for groups in parts)
-    margin = max(0.0 if resized else _EACH * count, _LEAST_CHANCE)
-    moved = _evidence_without_a_marker(observed, posterior, threshold) + _LEAST_CHANCE
+    margin = max(0.0 if resized else _EACH * count, LEAST_CHANCE)
+    moved = _evidence_without_a_marker(observed, posterior, threshold) + LEAST_CHANCE
     if explained < max(evidence + margin, moved):
         return None
     fitting = np.count_nonzero(first.chosen)
@@ -465,7 +461,7 @@ def by_chance(observed: Observed, posterior: Posterior, threshold: float) -> Fai
     best, sizes = np.sort(fitting), (found, 3 * found // 4, found // 2)
     chances = best / area
     surprises = [_surprise(total, k, sample, float(chances[k - 1])) for k in sizes if k]
-    if max(surprises, default=0.0) > _LEAST_CHANCE:
+    if max(surprises, default=0.0) > LEAST_CHANCE:
         return None
     return Failure(
         Reason.MODEL_ERROR,

@@ -50,7 +50,7 @@ from rs_localizer.core.shake import (
     shake_basis,
 )
 from rs_localizer.core.state import ANGULAR, MOTION_PARAMETERS, MOVE, PARAMETERS, POSE, TURN
-from rs_localizer.estimation.prior import PriorTerms, add_prior
+from rs_localizer.estimation.prior import RIDGE, PriorTerms, add_prior
 from rs_localizer.estimation.projection import Lines
 from rs_localizer.estimation.robust import LEAST_NOISE, TINY, back, eliminate, half_of
 from rs_localizer.native import entry, inlined, kernel
@@ -122,8 +122,6 @@ _SIZES = np.linspace(-2.5, 5.5, 11)
 _ODDS = -0.5 * _SIZES**2 - math.log(np.exp(-0.5 * _SIZES**2).sum())
 # Deviation of the logarithm of the size of vibration: a decade.
 _DECADE = math.log(10.0)
-# Ridge of products, for the rounding of columns that the motion mimics.
-_RIDGE = 1e-9
 # Errors that are left at least: the linear model holds no farther.
 _LEAST_LEFT = 1e-4
 # Noise beside a smooth error is so many times that of the fit without one.
@@ -529,7 +527,7 @@ def _without_motion(
     diagonal = np.diag(whole).copy()
     positive = eliminate(whole, PARAMETERS)
     for k in range(PARAMETERS, size):  # columns that the motion mimics wholly explain nothing
-        whole[k, k] += _RIDGE * diagonal[k]
+        whole[k, k] += RIDGE * diagonal[k]
     if size > PARAMETERS:
         whole[size, size] = max(whole[size, size], TINY)
     return whole, half_of(whole[:PARAMETERS, :PARAMETERS]), positive

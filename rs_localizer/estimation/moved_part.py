@@ -27,7 +27,7 @@ from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, rotatio
 from rs_localizer.estimation.hypotheses import Posterior
 from rs_localizer.estimation.linear_fit import ORDINARY, known_at, smooth_columns
 from rs_localizer.estimation.points import Observed
-from rs_localizer.estimation.prior import PriorTerms
+from rs_localizer.estimation.prior import RIDGE, PriorTerms
 from rs_localizer.estimation.projection import linearized
 from rs_localizer.estimation.robust import LEAST_NOISE, TINY, WIDEST_GATE
 from rs_localizer.estimation.search import GLOBAL_SHUTTER_SCALE
@@ -37,8 +37,9 @@ from rs_localizer.estimation.search import GLOBAL_SHUTTER_SCALE
 _LOOKS, _RARELY = 4, 120
 # Landmarks that are enough.
 _COMPARED = 200
-# Splits that chance makes in one search of 1,000.
-_LEAST_CHANCE = -math.log(1e-3)
+# Explanations that chance makes in one frame of 1,000 (Desolneux, Moisan and Morel, IJCV 2000: the
+# number of false alarms).
+LEAST_CHANCE = -math.log(1e-3)
 # Declared deviations of two landmarks within which they are no two parts.
 _DECLARED = 3.0 * math.sqrt(2.0)
 # Parts from which the search starts, beyond these quantiles along the axes and their diagonals.
@@ -53,8 +54,6 @@ _ROUNDS = 4
 # Logarithms of both focal lengths, which may be another camera's: no part moves as that shows it.
 _OTHER_LENGTH, _BESIDE = 0.5, PARAMETERS + 2
 _KEY_WEIGHTS = np.sqrt([2.0, 3.0, 5.0])
-# Of diagonals of normal equations, so that rounding leaves them positive.
-_RIDGE = 1e-9
 
 
 _Found = TypeVar("_Found")
@@ -302,7 +301,7 @@ def moved_part(looks: Sequence[Look], map_deviation: float) -> _Search[MovedPart
         split = yield from _settled(frames, start, beside)
         splits += [split] if split is not None else []
     best = max(splits, key=lambda split: split.gain, default=None)
-    if best is None or best.gain < alone.evidence + _LEAST_CHANCE:
+    if best is None or best.gain < alone.evidence + LEAST_CHANCE:
         return None
     if float(np.linalg.norm(best.way)) <= _DECLARED * map_deviation:
         return None
@@ -321,7 +320,7 @@ def _beside(frames: _Frames, kept: BoolArray, declared: bool) -> _Beside:
     normal = np.swapaxes(flat, 1, 2) @ flat
     weight = normal + frames.priors[int(declared)]
     places = np.arange(weight.shape[1])
-    weight[:, places, places] *= 1.0 + _RIDGE
+    weight[:, places, places] *= 1.0 + RIDGE
     inverse = np.asarray(np.linalg.inv(weight), np.float64)
     freedom = 2.0 * np.count_nonzero(kept) - float(np.sum(inverse * normal))
     return _Beside(flat, inverse, freedom)
@@ -337,7 +336,7 @@ def _fitted(frames: _Frames, part: BoolArray, kept: BoolArray, beside: _Beside) 
     back = inverse @ along
     square = np.sum(np.swapaxes(own, 1, 2) @ own - np.swapaxes(along, 1, 2) @ back, axis=0)
     information, target = square[1:, 1:].copy(), square[1:, 0]
-    information += max(_RIDGE * float(np.trace(information)), TINY) * np.eye(3)
+    information += max(RIDGE * float(np.trace(information)), TINY) * np.eye(3)
     way = np.asarray(np.linalg.solve(information, target), np.float64)
     found = back @ np.array([1.0, *-way])
     left = frames.rows[..., 0] - (frames.columns @ found[:, None, :, None])[..., 0]
@@ -392,7 +391,7 @@ def _side(frames: _Frames, fitting: BoolArray, beside: _Beside) -> BoolArray:
         squares += (sides @ (turned @ rows).reshape(count, -1)).reshape(-1, 4, 4)
         squares -= by_side @ inverse @ np.swapaxes(by_side, 1, 2)
     information, targets = squares[:, 1:, 1:], squares[:, 1:, 0]
-    information += max(_RIDGE * float(information[0].trace()), TINY) * np.eye(3)
+    information += max(RIDGE * float(information[0].trace()), TINY) * np.eye(3)
     shifts = np.linalg.solve(information, targets[..., None])[..., 0]
     found: BoolArray = sides[np.argmax(np.sum(targets * shifts, axis=1))] > 0.5
     return found

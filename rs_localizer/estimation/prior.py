@@ -43,7 +43,7 @@ if TYPE_CHECKING:  # which needs this module
     from rs_localizer.estimation.known_rotation import CoupledTurn
 
 # Rounding error of an orthonormal matrix, or of a symmetric one with a unit diagonal.
-_ROUNDING = 1e-6
+ROUNDING = 1e-6
 # Least eigenvalue of a covariance scaled to a unit diagonal; smaller ones are rounding.
 _LEAST_EIGENVALUE = 1e-12
 # Squares of larger numbers, and inverses of smaller variances, are infinite.
@@ -72,7 +72,7 @@ def check_motion(motion: Motion) -> None:
             raise ValueError(f"the prior motion's {name} is not finite: {value}")
     rotation = np.asarray(motion.rotation, float)
     off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if not (off <= _ROUNDING and np.linalg.det(rotation) > 0.0):
+    if not (off <= ROUNDING and np.linalg.det(rotation) > 0.0):
         raise ValueError(f"the prior motion's rotation is not orthonormal: {rotation.tolist()}")
 
 
@@ -101,7 +101,7 @@ def _flaw(covariance: Array2) -> int:
         return 0
     scale = np.sqrt(np.maximum(np.diag(block), _LEAST_VARIANCE))
     block /= np.outer(scale, scale)
-    if not np.all(np.abs(block - block.T) <= _ROUNDING):
+    if not np.all(np.abs(block - block.T) <= ROUNDING):
         return 1
     definite = len(known) == 0 or np.linalg.eigvalsh(block)[0] > _LEAST_EIGENVALUE
     return -1 if definite else 2
@@ -194,7 +194,7 @@ def state_in(motion: Motion, centre: Array) -> Array:
 
 
 # Ridge, a share of the rotation's variance, for an axis about which it may not rotate.
-_RIDGE = 1e-9
+RIDGE = 1e-9
 # A tenth of the speed goes with the accelerations of the whole. If any did, orientations of the
 # first row under one sine would be off by 3 % more (benchmarks.frames sine, 16 frames).
 _JOLTS = 10.0
@@ -351,7 +351,7 @@ def pivot_of(covariance: Array2) -> Array:
     """
     pivot, block = np.zeros(3), covariance[:3, :3].copy()
     if np.all(np.isfinite(covariance[:6, :6])):
-        along, turned = covariance[:3, 3:6], (1.0 + _RIDGE) * np.trace(block) * np.eye(3) - block
+        along, turned = covariance[:3, 3:6], (1.0 + RIDGE) * np.trace(block) * np.eye(3) - block
         vector = np.array([
             along[1, 2] - along[2, 1], along[2, 0] - along[0, 2], along[0, 1] - along[1, 0]
         ])  # fmt: skip
