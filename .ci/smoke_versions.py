@@ -18,7 +18,7 @@ from rs_localizer.io.bags import BagWriter, make_message, open_bag
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for storage in StoragePlugin:
-            path = Path(folder) / storage.name
+            path = Path(folder) / storage.name.lower()
             with BagWriter(path, storage) as bag:
                 bag.write("/a", make_message("std_msgs/msg/String", data="b"), 1)
             (lone,) = (file for file in path.iterdir() if file.suffix != ".yaml")

@@ -322,10 +322,10 @@ def _recordings(folder: Path) -> dict[str, bytes]:
     """Files of recordings by their suffixes: two readings of an IMU each."""
     found = {}
     for storage, suffix in ((StoragePlugin.MCAP, ".mcap"), (StoragePlugin.SQLITE3, ".db3")):
-        with BagWriter(folder / storage.name, storage) as bag:
+        with BagWriter(folder / storage.name.lower(), storage) as bag:
             for stamp_ns in (_STAMP, _STAMP + 10**9):
                 bag.write("/imu", _reading(), stamp_ns)
-        found[suffix] = next((folder / storage.name).glob(f"*{suffix}")).read_bytes()
+        found[suffix] = next((folder / storage.name.lower()).glob(f"*{suffix}")).read_bytes()
     found["metadata.yaml"] = (folder / "mcap" / "metadata.yaml").read_bytes()
     store = get_typestore(Stores.ROS1_NOETIC)
     with Ros1Writer(folder / "right.bag") as writer:

@@ -211,10 +211,10 @@ def test_of_a_worker_that_another_program_has_started(sent):
     plant(sent, "later")
     work = (
         "import sys\nfrom pathlib import Path\n"
-        "from rs_localizer.offline import fleet\n"
+        "from rs_localizer.offline import fleet, tasks\n"
         "def later(*_):\n    import later\n"
-        "out, said = Path('out').absolute(), f'{fleet.version(\"rs_localizer\")} x'\n"
-        "task = fleet.Task(later, Path('a.mcap'), out, said)\n"
+        "out, said = Path('out').absolute(), f'{tasks.VERSION} x'\n"
+        "task = tasks.Task(later, Path('a.mcap'), out, said)\n"
     )
     assert ran(sent, "-c", f"{work}later()") == ["later"]
     assert ran(sent, "-c", f"{work}fleet.perform_task(task)") == []
