@@ -350,7 +350,10 @@ class Localizer:
         # 3. A global-shutter start, then hypotheses of the solver (LO-RANSAC).
         best = self._search.find(observed)
         if not best.found:
-            return Failure(Reason.NO_HYPOTHESIS, "no three points of one camera gave a pose")
+            return Failure(
+                Reason.NO_HYPOTHESIS,
+                "no three points of one camera gave a pose: do they lie on a line or in a point?",
+            )
         if self.config.refinement == RefinementKind.NONE:
             return self._minimal(observed, best)
         # 4. Maximum a posteriori on the inliers; rest or motion; the leans of a plane.

@@ -29,7 +29,7 @@ _ROWS = np.linspace(-0.5, 0.5, 17)
 _PARABOLAS = np.vander(_ROWS, 3) @ np.linalg.pinv(np.vander(_ROWS, 3))
 # Pixels at the rim lie a little beyond the first and the last row.
 _LAST_ROW = 0.55
-# Those beyond the image, of what a lens moves there, at most so far.
+# No lens moves a pixel by half an image; rows and seconds in place of row times are larger.
 _FARTHEST = 1.0
 # s: no motion goes on as it is for so long; more are milliseconds or nanoseconds.
 _LONGEST_AWAY = 60.0

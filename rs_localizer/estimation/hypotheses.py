@@ -1,6 +1,6 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The posterior of a frame, of which its covariance is: hypotheses, fitted, weighed, and mixed.
+"""The posterior of a frame, whose covariance is published: hypotheses are fitted, weighed, mixed.
 
 docs/estimator.md is the page. A camera rests or moves at a typical speed, and is steady or
 vibrates within its frame: each is a Gaussian with its evidence (:mod:`.linear_fit`,

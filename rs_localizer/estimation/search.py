@@ -107,9 +107,9 @@ def pools_of(
 
 
 def views_of(observations: Observations, solver: Solver) -> IntArray:
-    """Return what sees each point (n,) for a solver: a side, or if rows do not matter, a camera.
+    """Return numbers (n,) of the sides that see points, or of the cameras if rows do not matter.
 
-    A camera is the first of its sides, which are at one place.
+    A camera has the number of its first side. All sides of a camera lie at one place.
     """
     mounts, sides = observations.mounts, observations.camera
     if solver.rolling_shutter or len(mounts.axes) == 1:

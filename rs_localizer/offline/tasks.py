@@ -18,7 +18,8 @@ Outcome = Figures | str
 """Figures of a task that is done; of one that failed, why, in one line."""
 
 MARKER, LOG = "fleet.json", "log.txt"
-"""In each complete result: what it is of, written last; and what the command would have said."""
+"""Files in each result: a marker, which is written last and names recording and settings, and the
+output of the command."""
 SUMMARY = "summary.csv"
 """A row of each recording."""
 
