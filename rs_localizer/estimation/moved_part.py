@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator, Sequence
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -131,9 +131,19 @@ class MovedParts:
         map_deviation: m, as declared.
     """
 
+    _search: _Search[MovedPart]
+
     def __init__(self, map_deviation: float) -> None:
         self._map_deviation = map_deviation
         self.reset()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return all but the search, which cannot be copied: a copy begins it anew."""
+        return {name: value for name, value in vars(self).items() if name != "_search"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._search = moved_part(self._looks, self._map_deviation)
 
     def reset(self) -> None:
         """Forget all frames."""
@@ -143,7 +153,6 @@ class MovedParts:
         """The part that frames show together: one alone may have a cause of its own."""
         self._apart = np.zeros((0, 3)), np.zeros((MOTION_PARAMETERS,) * 2)
         self._looks: list[Look] = []
-        self._search: _Search[MovedPart]
         self._count, self._next = 0, 1
 
     def add(
